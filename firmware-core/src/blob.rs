@@ -1,0 +1,492 @@
+//! The bytes of a model.
+//!
+//! Format version 1. All numbers are little-endian; offsets count from the first byte of the blob,
+//! which has to lie at an address divisible by four.
+//!
+//! | offset | size | field |
+//! |---|---|---|
+//! | 0 | 4 | magic, the bytes `KOOP` |
+//! | 4 | 2 | format version, 1 |
+//! | 6 | 2 | number of sections n, at most 16 |
+//! | 8 | 4 | total length in bytes, divisible by 4 |
+//! | 12 | 4 | CRC-32 (ISO-HDLC: polynomial 0x04C11DB7 reflected) of bytes 0 to 11 and 16 to the end |
+//! | 16 | 12 n | section table |
+//! | 16 + 12 n | | the sections, in the order of the table, each padded with zeros to a multiple of 4 |
+//!
+//! | offset in an entry | size | field |
+//! |---|---|---|
+//! | 0 | 2 | kind; 0x8000 and above may be skipped by a reader that does not know it |
+//! | 2 | 2 | encoding |
+//! | 4 | 4 | offset, where the section before it ends |
+//! | 8 | 4 | length without padding |
+//!
+//! | kind | section | encoding | status |
+//! |---|---|---|---|
+//! | 0x0001 | metadata: [`ModelRepr`] | 1: postcard 1 | required |
+//! | 0x0002 | coefficients `[outputs, dense_terms]` | 2: f32, dense, powers of the observables | required |
+//! | 0x0003 | self-test, below | 3: f32 | required |
+//! | 0x0004 | term indices of sparse coefficients | | reserved |
+//! | 0x0005 | coefficients in Q31 | | reserved |
+//! | 0x8001 | trained ranges `[observables, 2]`: smallest, largest raw value | 3: f32 | optional |
+//! | 0x8002 | error bounds | | reserved |
+//! | 0x8003 | signature | | reserved |
+//!
+//! The self-test is one prediction: with L the largest lag, the states at samples k − L … k, shape
+//! `[L + 1, states]`; the inputs at the same samples, shape `[L + 1, inputs]`; the expected
+//! coordinates at k + 1 and the tolerance of each, shape `[states]` both. The model is refused
+//! unless it predicts within the tolerance (angles compared on the circle).
+//!
+//! Metadata in postcard, field by field: integers of one byte as they are, lengths as varints,
+//! enumerations as a varint of the variant in the order of the declaration, `f32` as four bytes,
+//! text and lists with their length first.
+
+use core::cmp::Ordering;
+
+use crc::{CRC_32_ISO_HDLC, Crc};
+
+use crate::Scalar;
+use crate::capacity::MAX_STATES;
+use crate::model::{Model, ModelError, ModelRepr, Space, Structure};
+use crate::predictor::{PredictError, Predictor, PredictorState};
+
+/// First bytes of a blob.
+pub const MAGIC: [u8; 4] = *b"KOOP";
+/// The version of the format that this code reads and writes.
+pub const VERSION: u16 = 1;
+/// Sections a blob may have.
+pub const MAX_SECTIONS: usize = 16;
+
+const HEADER: usize = 16;
+const ENTRY: usize = 12;
+/// Kinds from here on may be skipped.
+const OPTIONAL: u16 = 0x8000;
+const METADATA: (u16, u16) = (0x0001, 1);
+const COEFFICIENTS: (u16, u16) = (0x0002, 2);
+const SELF_TEST: (u16, u16) = (0x0003, 3);
+const RANGES: (u16, u16) = (0x8001, 3);
+
+const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+
+/// Puts bytes at an address divisible by four, as a blob needs them.
+///
+/// ```
+/// use firmware_core::blob::Aligned;
+/// static BLOB: &Aligned<[u8]> = &Aligned(*b"KOOP...."); // or Aligned(*include_bytes!("model.bin"))
+/// assert_eq!(BLOB.0.as_ptr() as usize % 4, 0);
+/// ```
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(4))]
+pub struct Aligned<T: ?Sized>(pub T);
+
+/// Why bytes are not a model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ParseError {
+    /// The bytes do not begin at an address divisible by four.
+    Misaligned,
+    /// Fewer bytes than the header or its total length asks for.
+    Truncated {
+        /// Bytes asked for.
+        expected: usize,
+        /// Bytes there.
+        found: usize,
+    },
+    /// More bytes than the blob's total length.
+    Trailing {
+        /// Total length of the blob.
+        expected: usize,
+        /// Bytes there.
+        found: usize,
+    },
+    /// Not a blob at all.
+    Magic,
+    /// A format that this code does not read.
+    Version {
+        /// The version found.
+        found: u16,
+    },
+    /// The bytes have been damaged.
+    Checksum {
+        /// As stored.
+        expected: u32,
+        /// As computed.
+        found: u32,
+    },
+    /// The section table does not hold together.
+    SectionTable,
+    /// A section that has to be understood is not known to this code.
+    UnknownSection {
+        /// Its kind.
+        kind: u16,
+        /// Its encoding.
+        encoding: u16,
+    },
+    /// A required section is missing.
+    MissingSection {
+        /// Its kind.
+        kind: u16,
+    },
+    /// The metadata cannot be decoded; larger dimensions than the [capacities](crate::capacity) are
+    /// among the reasons.
+    Metadata,
+    /// The parts do not make a model.
+    Model(ModelError),
+    /// A section does not have the length that the metadata asks for.
+    SectionLength {
+        /// Its kind.
+        kind: u16,
+        /// Length in bytes that the metadata asks for.
+        expected: usize,
+        /// Length found.
+        found: usize,
+    },
+    /// The stored prediction is not reproduced.
+    SelfTest {
+        /// The coordinate that is off; the number of states when there was no prediction at all.
+        coordinate: usize,
+    },
+    /// The model belongs to another robot.
+    AnotherRobot,
+}
+
+/// Why a model cannot be written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum EmitError {
+    /// The buffer is too short.
+    BufferTooShort {
+        /// Its length.
+        found: usize,
+    },
+    /// The self-test has another shape than the model, or the model does not predict at all.
+    SelfTest,
+}
+
+/// One prediction that a blob carries to be checked with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SelfTest<'a> {
+    /// Coordinates at samples k − L … k, shape `[L + 1, states]`.
+    pub states: &'a [f32],
+    /// Inputs at the same samples, shape `[L + 1, inputs]`.
+    pub inputs: &'a [f32],
+    /// Coordinates at k + 1, shape `[states]`.
+    pub expected: &'a [f32],
+    /// Largest accepted difference of each, shape `[states]`.
+    pub tolerance: &'a [f32],
+}
+
+impl<'a> SelfTest<'a> {
+    /// Cuts the section's numbers into the parts that the model's shape asks for.
+    fn split(structure: &Structure<'_>, numbers: &'a [f32]) -> Option<Self> {
+        let (n, m) = (structure.states().len(), structure.inputs().len());
+        let samples = structure.lag().saturating_add(1);
+        let (states, rest) = numbers.split_at_checked(samples.saturating_mul(n))?;
+        let (inputs, rest) = rest.split_at_checked(samples.saturating_mul(m))?;
+        let (expected, tolerance) = rest.split_at_checked(n)?;
+        (tolerance.len() == n).then_some(Self { states, inputs, expected, tolerance })
+    }
+
+    fn len(structure: &Structure<'_>) -> usize {
+        let (n, m) = (structure.states().len(), structure.inputs().len());
+        let samples = structure.lag().saturating_add(1);
+        samples.saturating_mul(n.saturating_add(m)).saturating_add(n.saturating_mul(2))
+    }
+
+    /// What the model predicts from the stored samples, in `out`, shape `[states]`.
+    ///
+    /// # Errors
+    /// As [`Predictor::step`].
+    pub fn predict(&self, model: &Model<'_>, out: &mut [f32]) -> Result<(), PredictError> {
+        let structure = model.structure();
+        let m = structure.inputs().len();
+        let predictor = Predictor::new(model);
+        let mut state = PredictorState::new();
+        let mut inputs = self.inputs.chunks_exact(m.max(1));
+        let mut applied: &[f32] = &[];
+        for states in self.states.chunks_exact(structure.states().len().max(1)) {
+            predictor.observe(&mut state, applied, states)?;
+            applied = inputs.next().unwrap_or(&[]);
+        }
+        predictor.step(&mut state, applied)?;
+        predictor.coordinates(&state, out)
+    }
+
+    /// The first coordinate that the model does not predict within the tolerance.
+    fn failure(&self, model: &Model<'_>) -> Option<usize> {
+        let states = model.structure().states();
+        let mut predicted = [0.0; MAX_STATES];
+        let predicted = predicted.get_mut(..states.len())?;
+        if self.predict(model, predicted).is_err() {
+            return Some(states.len());
+        }
+        let expected = self.expected.iter().zip(self.tolerance);
+        predicted.iter().zip(states).zip(expected).position(|((p, state), (e, tolerance))| {
+            let difference = match state.space {
+                Space::Line => *p - *e,
+                Space::Circle => (*p - *e).wrap(),
+            };
+            Scalar::abs(difference).partial_cmp(tolerance).is_none_or(Ordering::is_gt)
+        })
+    }
+}
+
+/// Reads exactly one blob and checks everything: checksum, section table, dimensions against each
+/// other and the [capacities](crate::capacity), finite coefficients, and the stored prediction.
+///
+/// # Errors
+/// [`ParseError`] names the first thing that is wrong.
+pub fn parse(bytes: &[u8]) -> Result<Model<'_>, ParseError> {
+    let expected = total_length(bytes)?;
+    if bytes.len() > expected {
+        return Err(ParseError::Trailing { expected, found: bytes.len() });
+    }
+    parse_prefix(bytes)
+}
+
+/// [`parse`], refusing the model of another robot.
+///
+/// # Errors
+/// As [`parse`], and [`ParseError::AnotherRobot`].
+pub fn parse_for<'a>(robot: &str, bytes: &'a [u8]) -> Result<Model<'a>, ParseError> {
+    let model = parse(bytes)?;
+    if model.structure().robot() == robot { Ok(model) } else { Err(ParseError::AnotherRobot) }
+}
+
+/// Reads the blob at the beginning of a flash slot, whatever follows it.
+///
+/// # Errors
+/// As [`parse`].
+pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
+    if !slot.as_ptr().addr().is_multiple_of(4) {
+        return Err(ParseError::Misaligned);
+    }
+    let length = total_length(slot)?;
+    let truncated = ParseError::Truncated { expected: length, found: slot.len() };
+    let blob = slot.get(..length).ok_or(truncated)?;
+    let (expected, found) = (read_u32(blob, 12), checksum(blob));
+    if expected != found {
+        return Err(ParseError::Checksum { expected, found });
+    }
+    let sections = Sections::new(blob)?;
+
+    let metadata = sections.bytes(METADATA)?;
+    let (repr, rest) =
+        postcard::take_from_bytes::<ModelRepr<'_>>(metadata).map_err(|_| ParseError::Metadata)?;
+    if !rest.is_empty() {
+        return Err(ParseError::Metadata);
+    }
+    let structure = Structure::try_from(repr).map_err(ParseError::Model)?;
+    let coefficients = sections.numbers(COEFFICIENTS)?;
+    let ranges = match sections.numbers(RANGES) {
+        Err(ParseError::MissingSection { .. }) => None,
+        other => Some(other?),
+    };
+    let model = Model::new(structure, coefficients, ranges).map_err(ParseError::Model)?;
+
+    let numbers = sections.numbers(SELF_TEST)?;
+    let length = ParseError::SectionLength {
+        kind: SELF_TEST.0,
+        expected: SelfTest::len(model.structure()).saturating_mul(4),
+        found: numbers.len().saturating_mul(4),
+    };
+    let self_test = SelfTest::split(model.structure(), numbers).ok_or(length)?;
+    match self_test.failure(&model) {
+        None => Ok(model),
+        Some(coordinate) => Err(ParseError::SelfTest { coordinate }),
+    }
+}
+
+/// The prediction stored in a blob that [`parse`] accepts.
+///
+/// # Errors
+/// As [`parse`].
+pub fn self_test(bytes: &[u8]) -> Result<SelfTest<'_>, ParseError> {
+    let model = parse(bytes)?;
+    let numbers = Sections::new(bytes)?.numbers(SELF_TEST)?;
+    SelfTest::split(model.structure(), numbers)
+        .ok_or(ParseError::MissingSection { kind: SELF_TEST.0 })
+}
+
+/// Magic, version and total length of the header.
+fn total_length(bytes: &[u8]) -> Result<usize, ParseError> {
+    let header = bytes
+        .get(..HEADER)
+        .ok_or(ParseError::Truncated { expected: HEADER, found: bytes.len() })?;
+    if !header.starts_with(&MAGIC) {
+        return Err(ParseError::Magic);
+    }
+    let found = read_u16(header, 4);
+    if found != VERSION {
+        return Err(ParseError::Version { found });
+    }
+    let length = usize::try_from(read_u32(header, 8)).unwrap_or(usize::MAX);
+    if length < HEADER || !length.is_multiple_of(4) {
+        return Err(ParseError::SectionTable);
+    }
+    if length > bytes.len() {
+        return Err(ParseError::Truncated { expected: length, found: bytes.len() });
+    }
+    Ok(length)
+}
+
+fn checksum(blob: &[u8]) -> u32 {
+    let mut digest = CRC.digest();
+    digest.update(blob.get(..12).unwrap_or(&[]));
+    digest.update(blob.get(HEADER..).unwrap_or(&[]));
+    digest.finalize()
+}
+
+fn read_u16(bytes: &[u8], offset: usize) -> u16 {
+    let field = bytes.get(offset..).and_then(|rest| rest.first_chunk());
+    field.copied().map_or(0, u16::from_le_bytes)
+}
+
+fn read_u32(bytes: &[u8], offset: usize) -> u32 {
+    let field = bytes.get(offset..).and_then(|rest| rest.first_chunk());
+    field.copied().map_or(0, u32::from_le_bytes)
+}
+
+/// The section table of a blob whose checksum holds, checked.
+struct Sections<'a> {
+    blob: &'a [u8],
+    table: &'a [[u8; ENTRY]],
+}
+
+impl<'a> Sections<'a> {
+    fn new(blob: &'a [u8]) -> Result<Self, ParseError> {
+        let bad = ParseError::SectionTable;
+        let count = usize::from(read_u16(blob, 6));
+        if count > MAX_SECTIONS {
+            return Err(bad);
+        }
+        let mut end = HEADER.saturating_add(count.saturating_mul(ENTRY));
+        let (table, _) = blob.get(HEADER..end).ok_or(bad)?.as_chunks::<ENTRY>();
+        let kinds = || table.iter().map(|entry| read_u16(entry, 0));
+        for (i, entry) in table.iter().enumerate() {
+            let (kind, encoding) = (read_u16(entry, 0), read_u16(entry, 2));
+            if kinds().take(i).any(|earlier| earlier == kind) {
+                return Err(bad);
+            }
+            let known = [METADATA, COEFFICIENTS, SELF_TEST].contains(&(kind, encoding));
+            if kind < OPTIONAL && !known {
+                return Err(ParseError::UnknownSection { kind, encoding });
+            }
+            // Every byte of a blob belongs to one section or is padding of zeros.
+            let (offset, length) = (read_u32(entry, 4), read_u32(entry, 8));
+            let length = usize::try_from(length).unwrap_or(usize::MAX);
+            let padded = end.saturating_add(length).checked_next_multiple_of(4).ok_or(bad)?;
+            let padding = blob.get(end.saturating_add(length)..padded).ok_or(bad)?;
+            if usize::try_from(offset) != Ok(end) || padding.iter().any(|byte| *byte != 0) {
+                return Err(bad);
+            }
+            end = padded;
+        }
+        if end == blob.len() { Ok(Self { blob, table }) } else { Err(bad) }
+    }
+
+    /// The bytes of a section; one of another encoding counts as missing.
+    fn bytes(&self, section: (u16, u16)) -> Result<&'a [u8], ParseError> {
+        let missing = ParseError::MissingSection { kind: section.0 };
+        let mut table = self.table.iter();
+        let entry = table.find(|e| (read_u16(*e, 0), read_u16(*e, 2)) == section).ok_or(missing)?;
+        let offset = usize::try_from(read_u32(entry, 4)).unwrap_or(usize::MAX);
+        let length = usize::try_from(read_u32(entry, 8)).unwrap_or(usize::MAX);
+        self.blob.get(offset..offset.saturating_add(length)).ok_or(ParseError::SectionTable)
+    }
+
+    fn numbers(&self, section: (u16, u16)) -> Result<&'a [f32], ParseError> {
+        let bytes = self.bytes(section)?;
+        bytemuck::try_cast_slice(bytes).map_err(|_| ParseError::SectionLength {
+            kind: section.0,
+            expected: bytes.len().next_multiple_of(4),
+            found: bytes.len(),
+        })
+    }
+}
+
+/// Writes a model into `out`, with a prediction from `states` and `inputs` (shapes as in
+/// [`SelfTest`]) that may differ by `tolerance` per coordinate, and returns the number of bytes.
+///
+/// # Errors
+/// [`EmitError`].
+pub fn emit(
+    model: &Model<'_>,
+    states: &[f32],
+    inputs: &[f32],
+    tolerance: &[f32],
+    out: &mut [u8],
+) -> Result<usize, EmitError> {
+    let structure = model.structure();
+    let mut predicted = [0.0; MAX_STATES];
+    let expected = predicted.get_mut(..structure.states().len()).unwrap_or_default();
+    let test = SelfTest { states, inputs, expected: &[], tolerance };
+    test.predict(model, expected).map_err(|_| EmitError::SelfTest)?;
+    let self_test = [states, inputs, expected, tolerance];
+    if self_test.iter().map(|part| part.len()).sum::<usize>() != SelfTest::len(structure) {
+        return Err(EmitError::SelfTest);
+    }
+
+    let short = EmitError::BufferTooShort { found: out.len() };
+    let count: usize = if model.ranges().is_some() { 4 } else { 3 };
+    let table = HEADER.saturating_add(count.saturating_mul(ENTRY));
+    let mut writer = Writer { out, entry: HEADER, end: table };
+    let repr = structure.to_repr();
+    let metadata = writer.out.get_mut(table..).ok_or(short)?;
+    let length = postcard::to_slice(&repr, metadata).map_err(|_| short)?.len();
+    writer.close(METADATA, length).ok_or(short)?;
+    writer.numbers(COEFFICIENTS, &[model.coefficients()]).ok_or(short)?;
+    writer.numbers(SELF_TEST, &self_test).ok_or(short)?;
+    if let Some(ranges) = model.ranges() {
+        writer.numbers(RANGES, &[ranges]).ok_or(short)?;
+    }
+    let end = writer.end;
+    let blob = out.get_mut(..end).ok_or(short)?;
+    let length = u32::try_from(end).map_err(|_| short)?;
+    write(blob, 0, &MAGIC);
+    write(blob, 4, &VERSION.to_le_bytes());
+    write(blob, 6, &(count as u16).to_le_bytes());
+    write(blob, 8, &length.to_le_bytes());
+    let checksum = checksum(blob);
+    write(blob, 12, &checksum.to_le_bytes());
+    Ok(end)
+}
+
+/// Lays sections one after the other and fills in the table.
+struct Writer<'a> {
+    out: &'a mut [u8],
+    entry: usize,
+    end: usize,
+}
+
+impl Writer<'_> {
+    /// Ends the section of `length` bytes that was written at `end`: table entry and padding.
+    fn close(&mut self, (kind, encoding): (u16, u16), length: usize) -> Option<()> {
+        let padded = self.end.checked_add(length)?.checked_next_multiple_of(4)?;
+        self.out.get_mut(self.end.checked_add(length)?..padded)?.fill(0);
+        let entry = self.out.get_mut(self.entry..self.entry.checked_add(ENTRY)?)?;
+        write(entry, 0, &kind.to_le_bytes());
+        write(entry, 2, &encoding.to_le_bytes());
+        write(entry, 4, &u32::try_from(self.end).ok()?.to_le_bytes());
+        write(entry, 8, &u32::try_from(length).ok()?.to_le_bytes());
+        self.entry = self.entry.checked_add(ENTRY)?;
+        self.end = padded;
+        Some(())
+    }
+
+    fn numbers(&mut self, section: (u16, u16), parts: &[&[f32]]) -> Option<()> {
+        let mut length = 0_usize;
+        for number in parts.iter().copied().flatten() {
+            let at = self.end.checked_add(length)?;
+            self.out.get_mut(at..at.checked_add(4)?)?.copy_from_slice(&number.to_le_bytes());
+            length = length.checked_add(4)?;
+        }
+        self.close(section, length)
+    }
+}
+
+/// Overwrites the bytes at `offset` as far as there is room.
+fn write(out: &mut [u8], offset: usize, bytes: &[u8]) {
+    for (to, byte) in out.iter_mut().skip(offset).zip(bytes) {
+        *to = *byte;
+    }
+}

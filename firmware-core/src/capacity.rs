@@ -1,0 +1,28 @@
+//! What a controller built from this crate has room for.
+//!
+//! A blob is checked against these numbers once, when it is loaded; a larger model is refused with
+//! the field, the capacity and what was found. They bound the size of [`Model`](crate::Model) and
+//! [`PredictorState`](crate::PredictorState), not of the coefficients, which stay in flash.
+
+/// State coordinates.
+pub const MAX_STATES: usize = 8;
+/// Inputs.
+pub const MAX_INPUTS: usize = 6;
+/// Columns of the operator: one per coordinate, two for an absolute angle.
+pub const MAX_OUTPUTS: usize = 2 * MAX_STATES;
+/// The oldest sample a dictionary may look at, in samples before the present one.
+pub const MAX_LAG: usize = 6;
+/// Distinct observables of state, lagged samples and inputs.
+pub const MAX_OBSERVABLES: usize = 64;
+/// Kronecker blocks in the direct sum.
+pub const MAX_BLOCKS: usize = 64;
+/// Factors of all blocks together.
+pub const MAX_FACTORS: usize = 96;
+/// Factors of one block.
+pub const MAX_BLOCK_FACTORS: usize = 12;
+/// Highest Hermite or Fourier order of a factor.
+pub const MAX_ORDER: u8 = 9;
+/// Basis functions of one factor: a Fourier factor of the highest order.
+pub const MAX_BASIS: usize = 2 * MAX_ORDER as usize + 1;
+/// Terms of all blocks together, those held by an earlier block counted again.
+pub const MAX_TERMS: usize = 4096;

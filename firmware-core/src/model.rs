@@ -1,0 +1,448 @@
+//! What a model is: [`ModelRepr`] is what the bytes say, [`Structure`] is that checked, and
+//! [`Model`] is a structure with its coefficients.
+
+use core::cmp::Ordering;
+
+use heapless::Vec;
+use serde::{Deserialize, Serialize};
+
+use crate::Scalar;
+use crate::capacity::{MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_STATES};
+use crate::dictionary::{Block, Dictionary, DictionaryError, Factor, Observable, Source};
+
+/// Where a state coordinate lives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Space {
+    /// The real line ℝ.
+    Line,
+    /// The circle S¹; the coordinate is an angle in radians.
+    Circle,
+}
+
+/// What the operator's output for a coordinate stands for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Target {
+    /// The coordinate at the next sample; its sine and cosine (two outputs) on S¹.
+    Absolute,
+    /// Its change over the step, wrapped on S¹.
+    Increment,
+}
+
+/// A state coordinate.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct State<'a> {
+    /// Name, such as `phi`.
+    pub name: &'a str,
+    /// Unit, such as `rad`.
+    pub unit: &'a str,
+    /// ℝ or S¹.
+    pub space: Space,
+    /// Next value or change.
+    pub target: Target,
+    /// A prediction outside `[low, high]`, in the coordinate's unit, has diverged. Infinite bounds
+    /// are no bounds.
+    pub limit: [f32; 2],
+}
+
+/// An input.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Input<'a> {
+    /// Name, such as `omega_r`.
+    pub name: &'a str,
+    /// Unit, such as `rad/s`.
+    pub unit: &'a str,
+    /// The range that the actuator accepts, in its unit.
+    pub range: [f32; 2],
+}
+
+/// What the robot's motion does not depend on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Symmetry {
+    /// Every coordinate may enter the dictionary.
+    None,
+    /// These coordinates (bit i is coordinate i) do not enter it.
+    Translation {
+        /// One bit per coordinate.
+        coordinates: u8,
+    },
+    /// A planar pose does not enter it; its increments are expressed in the body frame: with
+    /// (Δx, Δy) the displacement over a step, the outputs are (c Δx + s Δy, −s Δx + c Δy, Δφ) with
+    /// s, c the sine and cosine of the heading at the beginning of the step.
+    Se2 {
+        /// Coordinate on ℝ along the first world axis.
+        x: u8,
+        /// Coordinate on ℝ along the second world axis.
+        y: u8,
+        /// Heading on S¹, from the first axis towards the second.
+        heading: u8,
+    },
+}
+
+impl Symmetry {
+    /// Whether the coordinate may not enter the dictionary.
+    pub fn excludes(self, coordinate: u8) -> bool {
+        match self {
+            Self::None => false,
+            Self::Translation { coordinates } => {
+                coordinates.checked_shr(coordinate.into()).unwrap_or(0) & 1 == 1
+            }
+            Self::Se2 { x, y, heading } => [x, y, heading].contains(&coordinate),
+        }
+    }
+}
+
+/// What a model was made from, as SHA-256.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Of the logs: every file's length (u64, little-endian) and bytes, in the order of the names.
+    pub logs: [u8; 32],
+    /// Of the robot description.
+    pub robot: [u8; 32],
+}
+
+/// The metadata of a model as the blob holds it, not yet checked.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelRepr<'a> {
+    /// The robot that the model belongs to.
+    pub robot: &'a str,
+    /// Time between samples \[s\].
+    pub sample_time_s: f32,
+    /// State coordinates.
+    #[serde(borrow)]
+    pub states: Vec<State<'a>, MAX_STATES>,
+    /// Inputs.
+    #[serde(borrow)]
+    pub inputs: Vec<Input<'a>, MAX_INPUTS>,
+    /// Symmetry.
+    pub symmetry: Symmetry,
+    /// Observables of the dictionary.
+    pub observables: Vec<Observable, MAX_OBSERVABLES>,
+    /// Factors of all blocks, in order.
+    pub factors: Vec<Factor, MAX_FACTORS>,
+    /// Kronecker blocks.
+    pub blocks: Vec<Block, MAX_BLOCKS>,
+    /// What it was made from.
+    pub provenance: Provenance,
+}
+
+/// Why metadata and coefficients do not make a model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ModelError {
+    /// There is no state coordinate.
+    NoState,
+    /// The sample time is not a positive finite number.
+    SampleTime,
+    /// A limit, range, centre or gain is not usable: NaN, empty, or zero.
+    Number {
+        /// Which field.
+        field: &'static str,
+        /// Index of the state, input or observable.
+        index: usize,
+    },
+    /// The symmetry names coordinates that are not there, live in the wrong space, or are not
+    /// predicted by increments.
+    Symmetry {
+        /// Index of the coordinate.
+        coordinate: u8,
+    },
+    /// An observable reads something that is not there, that the symmetry excludes, or that does
+    /// not live in its space.
+    Observable {
+        /// Index of the observable.
+        observable: usize,
+    },
+    /// The dictionary does not hold together.
+    Dictionary(DictionaryError),
+    /// Some number of elements is not what the metadata asks for.
+    DimensionMismatch {
+        /// Which one.
+        field: &'static str,
+        /// As the metadata says.
+        expected: usize,
+        /// As found.
+        found: usize,
+    },
+    /// A coefficient is NaN or infinite.
+    NotFinite {
+        /// Its index, outputs slowest.
+        coefficient: usize,
+    },
+}
+
+/// A checked model without its coefficients: spaces, symmetry, targets, dictionary.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Structure<'a> {
+    robot: &'a str,
+    sample_time_s: f32,
+    states: Vec<State<'a>, MAX_STATES>,
+    inputs: Vec<Input<'a>, MAX_INPUTS>,
+    symmetry: Symmetry,
+    dictionary: Dictionary,
+    provenance: Provenance,
+    outputs: u8,
+    lag: u8,
+    /// Bit i: the sine and cosine of coordinate i are needed.
+    trigonometric: u8,
+    /// Lagged increments are observed.
+    increments: bool,
+}
+
+impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
+    type Error = ModelError;
+
+    fn try_from(repr: ModelRepr<'a>) -> Result<Self, ModelError> {
+        let ModelRepr {
+            robot,
+            sample_time_s,
+            states,
+            inputs,
+            symmetry,
+            observables,
+            factors,
+            blocks,
+            provenance,
+        } = repr;
+        if states.is_empty() {
+            return Err(ModelError::NoState);
+        }
+        if !(sample_time_s.is_finite() && sample_time_s > 0.0) {
+            return Err(ModelError::SampleTime);
+        }
+        let (mut outputs, mut trigonometric) = (0_u8, 0_u8);
+        for (index, state) in states.iter().enumerate() {
+            let [low, high] = state.limit;
+            if low.partial_cmp(&high) != Some(Ordering::Less) {
+                return Err(ModelError::Number { field: "limit of a state", index });
+            }
+            let absolute_angle = (state.space, state.target) == (Space::Circle, Target::Absolute);
+            outputs = outputs.saturating_add(if absolute_angle { 2 } else { 1 });
+            if absolute_angle {
+                trigonometric |= bit(index);
+            }
+        }
+        for (index, input) in inputs.iter().enumerate() {
+            let [low, high] = input.range;
+            if !(low < high && low.is_finite() && high.is_finite()) {
+                return Err(ModelError::Number { field: "range of an input", index });
+            }
+        }
+        check_symmetry(symmetry, &states)?;
+        if let Symmetry::Se2 { heading, .. } = symmetry {
+            trigonometric |= bit(heading.into());
+        }
+
+        let dictionary =
+            Dictionary::new(observables, factors, blocks).map_err(ModelError::Dictionary)?;
+        let (mut lag, mut increments) = (0_u8, false);
+        for (index, o) in dictionary.observables().iter().enumerate() {
+            let space = |i: u8| states.get(usize::from(i)).map(|s| s.space);
+            let free = |i: u8| !symmetry.excludes(i);
+            let fits = match o.source {
+                Source::State(i) => space(i) == Some(Space::Line) && free(i),
+                Source::Sin(i) | Source::Cos(i) => {
+                    trigonometric |= bit(i.into());
+                    space(i) == Some(Space::Circle) && free(i) && (o.centre, o.gain) == (0.0, 1.0)
+                }
+                Source::Increment(i) => {
+                    increments = true;
+                    space(i).is_some() && o.lag > 0
+                }
+                Source::Input(i) => usize::from(i) < inputs.len(),
+            };
+            if !fits || usize::from(o.lag) > MAX_LAG {
+                return Err(ModelError::Observable { observable: index });
+            }
+            if !(o.centre.is_finite() && o.gain.is_finite() && o.gain != 0.0) {
+                return Err(ModelError::Number { field: "centre or gain of an observable", index });
+            }
+            lag = lag.max(o.lag);
+        }
+        Ok(Self {
+            robot,
+            sample_time_s,
+            states,
+            inputs,
+            symmetry,
+            dictionary,
+            provenance,
+            outputs,
+            lag,
+            trigonometric,
+            increments,
+        })
+    }
+}
+
+fn check_symmetry(symmetry: Symmetry, states: &[State<'_>]) -> Result<(), ModelError> {
+    let fits = |coordinate: u8, space: Option<Space>| {
+        let found = states.get(usize::from(coordinate));
+        match found {
+            Some(s) if s.target == Target::Increment && space.is_none_or(|e| e == s.space) => {
+                Ok(())
+            }
+            _ => Err(ModelError::Symmetry { coordinate }),
+        }
+    };
+    match symmetry {
+        Symmetry::None => Ok(()),
+        Symmetry::Translation { .. } => {
+            (0..8).filter(|i| symmetry.excludes(*i)).try_for_each(|i| fits(i, None))
+        }
+        Symmetry::Se2 { x, y, heading } => {
+            fits(x, Some(Space::Line))?;
+            fits(y, Some(Space::Line))?;
+            fits(heading, Some(Space::Circle))?;
+            if x == y { Err(ModelError::Symmetry { coordinate: y }) } else { Ok(()) }
+        }
+    }
+}
+
+/// Bit `index` of a set of coordinates; there are at most eight.
+fn bit(index: usize) -> u8 {
+    u32::try_from(index).ok().and_then(|i| 1_u8.checked_shl(i)).unwrap_or(0)
+}
+
+impl<'a> Structure<'a> {
+    /// The robot that the model belongs to.
+    pub fn robot(&self) -> &'a str {
+        self.robot
+    }
+
+    /// Time between samples \[s\].
+    pub fn sample_time_s(&self) -> f32 {
+        self.sample_time_s
+    }
+
+    /// State coordinates, in order.
+    pub fn states(&self) -> &[State<'a>] {
+        &self.states
+    }
+
+    /// Inputs, in order.
+    pub fn inputs(&self) -> &[Input<'a>] {
+        &self.inputs
+    }
+
+    /// Symmetry.
+    pub fn symmetry(&self) -> Symmetry {
+        self.symmetry
+    }
+
+    /// The dictionary.
+    pub fn dictionary(&self) -> &Dictionary {
+        &self.dictionary
+    }
+
+    /// What the model was made from.
+    pub fn provenance(&self) -> Provenance {
+        self.provenance
+    }
+
+    /// Columns of the operator: one per coordinate, two for an absolute angle (sine, cosine).
+    pub fn outputs(&self) -> usize {
+        self.outputs.into()
+    }
+
+    /// The oldest sample that the dictionary looks at, in samples before the present one.
+    pub fn lag(&self) -> usize {
+        self.lag.into()
+    }
+
+    /// Whether sine and cosine of a coordinate are needed.
+    pub(crate) fn needs_trigonometry(&self, coordinate: usize) -> bool {
+        self.trigonometric & bit(coordinate) != 0
+    }
+
+    /// Whether lagged increments are observed.
+    pub(crate) fn needs_increments(&self) -> bool {
+        self.increments
+    }
+
+    /// The metadata again, as a blob holds it.
+    pub fn to_repr(&self) -> ModelRepr<'a> {
+        let mut repr = ModelRepr {
+            robot: self.robot,
+            sample_time_s: self.sample_time_s,
+            states: self.states.clone(),
+            inputs: self.inputs.clone(),
+            symmetry: self.symmetry,
+            observables: Vec::new(),
+            factors: Vec::new(),
+            blocks: Vec::new(),
+            provenance: self.provenance,
+        };
+        // The same capacities: nothing can be lost.
+        let _ = repr.observables.extend_from_slice(self.dictionary.observables());
+        for (block, factors) in self.dictionary.blocks() {
+            let _ = repr.blocks.push(block);
+            let _ = repr.factors.extend_from_slice(factors);
+        }
+        repr
+    }
+}
+
+/// A model that can predict: checked once, immutable, its coefficients read in place.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Model<'a, S = f32> {
+    structure: Structure<'a>,
+    coefficients: &'a [S],
+    ranges: Option<&'a [S]>,
+}
+
+impl<'a, S: Scalar> Model<'a, S> {
+    /// Joins a structure and its coefficients.
+    ///
+    /// `coefficients` has shape `[outputs, dense_terms]`, outputs slowest: the operator F of
+    /// z⁺ = Ψ F, transposed, in the *monomial* form of the dictionary (powers of the observables
+    /// where the lift has Hermite polynomials). `ranges`, shape `[observables, 2]`, is the smallest
+    /// and largest raw value of each observable in the training data.
+    ///
+    /// # Errors
+    /// [`ModelError::DimensionMismatch`], [`ModelError::NotFinite`], or [`ModelError::Number`] for a
+    /// range that is NaN or the wrong way round.
+    pub fn new(
+        structure: Structure<'a>,
+        coefficients: &'a [S],
+        ranges: Option<&'a [S]>,
+    ) -> Result<Self, ModelError> {
+        let expected = structure.outputs().saturating_mul(structure.dictionary().dense_terms());
+        let mismatch =
+            |field, expected, found| Err(ModelError::DimensionMismatch { field, expected, found });
+        if coefficients.len() != expected {
+            return mismatch("coefficients", expected, coefficients.len());
+        }
+        if let Some(coefficient) = coefficients.iter().position(|c| !c.is_finite()) {
+            return Err(ModelError::NotFinite { coefficient });
+        }
+        if let Some(ranges) = ranges {
+            let expected = structure.dictionary().observables().len().saturating_mul(2);
+            if ranges.len() != expected {
+                return mismatch("ranges", expected, ranges.len());
+            }
+            let (pairs, _) = ranges.as_chunks::<2>();
+            if let Some(index) = pairs
+                .iter()
+                .position(|[low, high]| low.partial_cmp(high).is_none_or(Ordering::is_gt))
+            {
+                return Err(ModelError::Number { field: "trained range of an observable", index });
+            }
+        }
+        Ok(Self { structure, coefficients, ranges })
+    }
+
+    /// Everything but the numbers.
+    pub fn structure(&self) -> &Structure<'a> {
+        &self.structure
+    }
+
+    /// Shape `[outputs, dense_terms]`, outputs slowest.
+    pub fn coefficients(&self) -> &'a [S] {
+        self.coefficients
+    }
+
+    /// Smallest and largest raw value of every observable in the training data.
+    pub fn ranges(&self) -> Option<&'a [S]> {
+        self.ranges
+    }
+}

@@ -1,0 +1,289 @@
+//! Predicting: one step, or a rollout that lifts again at every step.
+
+use crate::Scalar;
+use crate::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES};
+use crate::dictionary::block_size;
+use crate::history::History;
+use crate::kernel::contract;
+use crate::model::Model;
+
+/// The first time a rollout left the range that the model was trained in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OutOfRange {
+    /// The step whose prediction used the value; 1 is the first step after the last measurement.
+    pub step: u32,
+    /// Index of the observable.
+    pub observable: usize,
+}
+
+/// Why there is no prediction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum PredictError {
+    /// The model looks at earlier samples that have not been observed yet.
+    NotReady {
+        /// Samples observed.
+        have: usize,
+        /// Samples needed: the largest lag and the present one.
+        need: usize,
+    },
+    /// A slice does not have the length that the model asks for.
+    DimensionMismatch {
+        /// Which argument.
+        field: &'static str,
+        /// Expected length.
+        expected: usize,
+        /// Length found.
+        found: usize,
+    },
+    /// A measurement is NaN or infinite.
+    NotFinite {
+        /// Index of the coordinate.
+        coordinate: usize,
+    },
+    /// The prediction left the finite numbers, a hard limit of the model, or the circle.
+    Diverged {
+        /// The step that failed; 1 is the first step after the last measurement.
+        step: u32,
+    },
+}
+
+/// All that moves while a [`Predictor`] works.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PredictorState<S = f32> {
+    history: History<S>,
+    step: u32,
+    out_of_range: Option<OutOfRange>,
+}
+
+impl<S: Scalar> Default for PredictorState<S> {
+    fn default() -> Self {
+        Self { history: History::default(), step: 0, out_of_range: None }
+    }
+}
+
+impl<S: Scalar> PredictorState<S> {
+    /// Nothing observed yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Steps predicted since the last measurement.
+    pub fn step(&self) -> u32 {
+        self.step
+    }
+
+    /// The first step and observable outside the trained range since the last measurement.
+    pub fn out_of_range(&self) -> Option<OutOfRange> {
+        self.out_of_range
+    }
+
+    /// The samples.
+    pub fn history(&self) -> &History<S> {
+        &self.history
+    }
+}
+
+/// Predicts with a model; holds nothing that changes.
+///
+/// ```
+/// use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
+/// use firmware_core::model::{Input, Model, ModelRepr, Provenance, Space, State, Structure};
+/// use firmware_core::model::{Symmetry, Target};
+/// use firmware_core::{PredictError, Predictor, PredictorState};
+///
+/// // x⁺ = 0.5 x + 2 u as a Kronecker block [1, x] ⊗ [1, u]: terms 1, u, x, x·u.
+/// let observable = |source| Observable { source, lag: 0, centre: 0.0, gain: 1.0 };
+/// let factor = |observable| Factor { observable, basis: Basis::Hermite, order: 1 };
+/// let structure = Structure::try_from(ModelRepr {
+///     robot: "cart",
+///     sample_time_s: 0.1,
+///     states: [State {
+///         name: "x", unit: "m", space: Space::Line, target: Target::Absolute, limit: [-9.0, 9.0],
+///     }].into_iter().collect(),
+///     inputs: [Input { name: "u", unit: "V", range: [-1.0, 1.0] }].into_iter().collect(),
+///     symmetry: Symmetry::None,
+///     observables: [observable(Source::State(0)), observable(Source::Input(0))].into_iter().collect(),
+///     factors: [factor(0), factor(1)].into_iter().collect(),
+///     blocks: [Block { factors: 2, max_degree: 0 }].into_iter().collect(),
+///     provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+/// }).unwrap();
+/// let coefficients = [0.0_f32, 2.0, 0.5, 0.0];
+/// let model = Model::new(structure, &coefficients, None).unwrap();
+///
+/// let predictor = Predictor::new(&model);
+/// let mut state = PredictorState::new();
+/// predictor.observe(&mut state, &[], &[4.0]).unwrap();
+/// let mut x = [0.0; 3];
+/// predictor.rollout(&mut state, &[1.0, 1.0, -1.0], &mut x).unwrap();
+/// assert_eq!(x, [4.0, 4.0, 0.0]); // 2 + 2, 2 + 2, 2 − 2
+/// // From 8 m, 3 V would take the cart to 10 m, beyond its limit of 9 m.
+/// predictor.observe(&mut state, &[0.0], &[8.0]).unwrap();
+/// assert_eq!(predictor.step(&mut state, &[3.0]), Err(PredictError::Diverged { step: 1 }));
+/// ```
+#[derive(Clone, Copy, Debug)]
+pub struct Predictor<'m, 'a, S = f32> {
+    model: &'m Model<'a, S>,
+}
+
+impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
+    /// A predictor of the model.
+    pub fn new(model: &'m Model<'a, S>) -> Self {
+        Self { model }
+    }
+
+    /// The model.
+    pub fn model(&self) -> &'m Model<'a, S> {
+        self.model
+    }
+
+    /// Takes a measurement: `coordinates`, shape `[states]`, in the model's units (angles in
+    /// radians, any turn), after `applied`, shape `[inputs]`, acted for one sample time. Before the
+    /// first measurement `applied` may be empty.
+    ///
+    /// # Errors
+    /// [`PredictError::DimensionMismatch`] and [`PredictError::NotFinite`]; the state is unchanged.
+    pub fn observe(
+        &self,
+        state: &mut PredictorState<S>,
+        applied: &[S],
+        coordinates: &[S],
+    ) -> Result<(), PredictError> {
+        let structure = self.model.structure();
+        expect("coordinates", structure.states().len(), coordinates.len())?;
+        if !(state.history.is_empty() && applied.is_empty()) {
+            expect("inputs", structure.inputs().len(), applied.len())?;
+        }
+        if let Some(coordinate) = coordinates.iter().position(|x| !x.is_finite()) {
+            return Err(PredictError::NotFinite { coordinate });
+        }
+        let sample = structure.sample(coordinates);
+        state.history.push(structure, applied, &sample);
+        state.step = 0;
+        state.out_of_range = None;
+        Ok(())
+    }
+
+    /// Predicts one sample time ahead under `input`, shape `[inputs]`, and moves the state there.
+    ///
+    /// # Errors
+    /// [`PredictError::NotReady`] until the history is full, [`PredictError::DimensionMismatch`],
+    /// [`PredictError::Diverged`]; the state is unchanged.
+    #[inline]
+    pub fn step(&self, state: &mut PredictorState<S>, input: &[S]) -> Result<(), PredictError> {
+        let structure = self.model.structure();
+        expect("inputs", structure.inputs().len(), input.len())?;
+        let (have, need) = (state.history.len(), structure.lag().saturating_add(1));
+        if have < need {
+            return Err(PredictError::NotReady { have, need });
+        }
+        let step = state.step.saturating_add(1);
+
+        let mut values = [S::ZERO; MAX_OBSERVABLES];
+        state.history.observe(structure, input, &mut values);
+        let mut outputs = [S::ZERO; MAX_OUTPUTS];
+        let outputs = outputs.get_mut(..structure.outputs()).unwrap_or_default();
+        let stride = structure.dictionary().dense_terms();
+        let mut coefficients = self.model.coefficients();
+        for (_, factors) in structure.dictionary().blocks() {
+            contract(factors, &values, coefficients, stride, outputs);
+            coefficients = coefficients.get(block_size(factors)..).unwrap_or(&[]);
+        }
+        let diverged = PredictError::Diverged { step };
+        let next = state.history.retract(structure, outputs).ok_or(diverged)?;
+
+        if state.out_of_range.is_none() {
+            state.out_of_range = self
+                .first_out_of_range(&state.history, input)
+                .map(|observable| OutOfRange { step, observable });
+        }
+        state.history.push(structure, input, &next);
+        state.step = step;
+        Ok(())
+    }
+
+    /// The first observable outside its trained range.
+    #[inline]
+    fn first_out_of_range(&self, history: &History<S>, input: &[S]) -> Option<usize> {
+        let (ranges, _) = self.model.ranges()?.as_chunks::<2>();
+        history
+            .raw(self.model.structure(), input)
+            .zip(ranges)
+            .position(|(raw, [low, high])| !(raw >= *low && raw <= *high))
+    }
+
+    /// The present coordinates in `out`, shape `[states]`: measured or predicted, whichever came
+    /// last; predicted angles in (−π, π].
+    ///
+    /// # Errors
+    /// [`PredictError::DimensionMismatch`].
+    #[inline]
+    pub fn coordinates(
+        &self,
+        state: &PredictorState<S>,
+        out: &mut [S],
+    ) -> Result<(), PredictError> {
+        expect("coordinates", self.model.structure().states().len(), out.len())?;
+        state.history.coordinates(self.model.structure(), out);
+        Ok(())
+    }
+
+    /// Predicts over a sequence of inputs, shape `[horizon, inputs]`, into `predicted`, shape
+    /// `[horizon, states]`, and moves the state to the end. Clone the state first to keep it.
+    ///
+    /// # Errors
+    /// As [`step`](Self::step); the rows of `predicted` before the step that failed are valid, the
+    /// others are untouched.
+    pub fn rollout(
+        &self,
+        state: &mut PredictorState<S>,
+        inputs: &[S],
+        predicted: &mut [S],
+    ) -> Result<(), PredictError> {
+        let (n, m) = self.dimensions();
+        let horizon = predicted.len().checked_div(n).unwrap_or(0);
+        expect("predicted", horizon.saturating_mul(n), predicted.len())?;
+        expect("inputs", horizon.saturating_mul(m), inputs.len())?;
+        // Without inputs there is nothing to cut into rows: every step gets the empty one.
+        let mut rows = inputs.chunks_exact(m.max(1));
+        for out in predicted.chunks_exact_mut(n) {
+            self.step(state, rows.next().unwrap_or(&[]))?;
+            state.history.coordinates(self.model.structure(), out);
+        }
+        Ok(())
+    }
+
+    /// The same with one input, shape `[inputs]`, held over the whole horizon.
+    ///
+    /// # Errors
+    /// As [`rollout`](Self::rollout).
+    pub fn rollout_held(
+        &self,
+        state: &mut PredictorState<S>,
+        input: &[S],
+        predicted: &mut [S],
+    ) -> Result<(), PredictError> {
+        let (n, _) = self.dimensions();
+        let horizon = predicted.len().checked_div(n).unwrap_or(0);
+        expect("predicted", horizon.saturating_mul(n), predicted.len())?;
+        for out in predicted.chunks_exact_mut(n) {
+            self.step(state, input)?;
+            state.history.coordinates(self.model.structure(), out);
+        }
+        Ok(())
+    }
+
+    /// States (at least 1) and inputs.
+    fn dimensions(&self) -> (usize, usize) {
+        let structure = self.model.structure();
+        (structure.states().len().clamp(1, MAX_STATES), structure.inputs().len())
+    }
+}
+
+fn expect(field: &'static str, expected: usize, found: usize) -> Result<(), PredictError> {
+    if expected == found {
+        Ok(())
+    } else {
+        Err(PredictError::DimensionMismatch { field, expected, found })
+    }
+}

@@ -1,0 +1,119 @@
+//! The two float types a model is evaluated in.
+
+use core::fmt::Debug;
+use core::ops::{Add, Div, Mul, Neg, Sub};
+
+mod sealed {
+    pub trait Sealed {}
+    impl Sealed for f32 {}
+    impl Sealed for f64 {}
+}
+
+/// `f32` on the controller, `f64` in the trainer.
+///
+/// The elementary functions call `libm` by name. std's and num-traits' versions differ from it in
+/// the last bit of about one value in seventy, and which of them a generic `sin` means changes with
+/// the crates that happen to be in the build; laptop and controller would then disagree.
+pub trait Scalar:
+    sealed::Sealed
+    + Copy
+    + Debug
+    + Default
+    + PartialOrd
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+    + 'static
+{
+    /// 0
+    const ZERO: Self;
+    /// 1
+    const ONE: Self;
+    /// π
+    const PI: Self;
+    /// 2π
+    const TAU: Self;
+
+    /// The same number; `f32` to `f64` is exact.
+    fn from_f32(value: f32) -> Self;
+    /// A small integer.
+    fn from_u8(value: u8) -> Self;
+    /// `(sin, cos)` of an angle in radians.
+    fn sin_cos(self) -> (Self, Self);
+    /// The angle of the point `(x, self)`, in (−π, π].
+    fn atan2(self, x: Self) -> Self;
+    /// Square root, correctly rounded.
+    fn sqrt(self) -> Self;
+    /// The smallest integer that is not less.
+    fn ceil(self) -> Self;
+    /// Absolute value.
+    fn abs(self) -> Self;
+    /// Neither infinite nor NaN.
+    fn is_finite(self) -> bool;
+
+    /// The same angle in (−π, π] \[rad\].
+    ///
+    /// ```
+    /// use firmware_core::Scalar;
+    /// assert_eq!(0.5_f64.wrap(), 0.5);
+    /// assert!((4.0_f64.wrap() - (4.0 - core::f64::consts::TAU)).abs() < 1e-15);
+    /// assert_eq!((-core::f64::consts::PI).wrap(), core::f64::consts::PI);
+    /// ```
+    #[inline]
+    fn wrap(self) -> Self {
+        if self > -Self::PI && self <= Self::PI {
+            self
+        } else {
+            self - Self::TAU * ((self - Self::PI) / Self::TAU).ceil()
+        }
+    }
+}
+
+macro_rules! scalar {
+    ($float:ident, $sincos:ident, $atan2:ident, $sqrt:ident, $ceil:ident, $fabs:ident) => {
+        impl Scalar for $float {
+            const ZERO: Self = 0.0;
+            const ONE: Self = 1.0;
+            const PI: Self = core::$float::consts::PI;
+            const TAU: Self = core::$float::consts::TAU;
+
+            #[inline]
+            fn from_f32(value: f32) -> Self {
+                value.into()
+            }
+            #[inline]
+            fn from_u8(value: u8) -> Self {
+                value.into()
+            }
+            #[inline]
+            fn sin_cos(self) -> (Self, Self) {
+                libm::$sincos(self)
+            }
+            #[inline]
+            fn atan2(self, x: Self) -> Self {
+                libm::$atan2(self, x)
+            }
+            #[inline]
+            fn sqrt(self) -> Self {
+                libm::$sqrt(self)
+            }
+            #[inline]
+            fn ceil(self) -> Self {
+                libm::$ceil(self)
+            }
+            #[inline]
+            fn abs(self) -> Self {
+                libm::$fabs(self)
+            }
+            #[inline]
+            fn is_finite(self) -> bool {
+                self.is_finite()
+            }
+        }
+    };
+}
+
+scalar!(f32, sincosf, atan2f, sqrtf, ceilf, fabsf);
+scalar!(f64, sincos, atan2, sqrt, ceil, fabs);
