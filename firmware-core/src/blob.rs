@@ -417,14 +417,17 @@ pub fn emit(
     out: &mut [u8],
 ) -> Result<usize, EmitError> {
     let structure = model.structure();
+    let (n, m) = (structure.states().len(), structure.inputs().len());
+    let samples = structure.lag().saturating_add(1);
+    let found = (states.len(), inputs.len(), tolerance.len());
+    if found != (samples.saturating_mul(n), samples.saturating_mul(m), n) {
+        return Err(EmitError::SelfTest);
+    }
     let mut predicted = [0.0; MAX_STATES];
-    let expected = predicted.get_mut(..structure.states().len()).unwrap_or_default();
+    let expected = predicted.get_mut(..n).unwrap_or_default();
     let test = SelfTest { states, inputs, expected: &[], tolerance };
     test.predict(model, expected).map_err(|_| EmitError::SelfTest)?;
     let self_test = [states, inputs, expected, tolerance];
-    if self_test.iter().map(|part| part.len()).sum::<usize>() != SelfTest::len(structure) {
-        return Err(EmitError::SelfTest);
-    }
 
     let short = EmitError::BufferTooShort { found: out.len() };
     let count: usize = if model.ranges().is_some() { 4 } else { 3 };

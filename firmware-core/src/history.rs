@@ -199,12 +199,17 @@ impl<S: Scalar> History<S> {
                     (*next.sin.get_mut(i)?, *next.cos.get_mut(i)?) = x.sin_cos();
                 }
             }
-            let [low, high] = state.limit;
-            if !absolute_angle {
-                let inside = *x >= S::from_f32(low) && *x <= S::from_f32(high);
-                if !(inside && x.is_finite()) {
-                    return None;
-                }
+            let [low, high] = state.limit.map(S::from_f32);
+            let value = if !absolute_angle {
+                *x
+            } else if low > -S::PI || high < S::PI {
+                at(&next.sin, i as u8).atan2(at(&next.cos, i as u8))
+            } else {
+                // A limit that no angle leaves is not worth an arc tangent.
+                continue;
+            };
+            if !(value >= low && value <= high && value.is_finite()) {
+                return None;
             }
         }
         Some(next)

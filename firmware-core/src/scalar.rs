@@ -48,6 +48,8 @@ pub trait Scalar:
     fn sqrt(self) -> Self;
     /// The smallest integer that is not less.
     fn ceil(self) -> Self;
+    /// What the division towards zero leaves over, exact, with the sign of `self`.
+    fn rem(self, divisor: Self) -> Self;
     /// Absolute value.
     fn abs(self) -> Self;
     /// Neither infinite nor NaN.
@@ -66,13 +68,22 @@ pub trait Scalar:
         if self > -Self::PI && self <= Self::PI {
             self
         } else {
-            self - Self::TAU * ((self - Self::PI) / Self::TAU).ceil()
+            // The remainder and one turn more or less are exact, so that no rounding at the seam
+            // and no large angle leaves the interval.
+            let turn = self.rem(Self::TAU);
+            if turn > Self::PI {
+                turn - Self::TAU
+            } else if turn <= -Self::PI {
+                turn + Self::TAU
+            } else {
+                turn
+            }
         }
     }
 }
 
 macro_rules! scalar {
-    ($float:ident, $sincos:ident, $atan2:ident, $sqrt:ident, $ceil:ident, $fabs:ident) => {
+    ($float:ident, $sincos:ident, $atan2:ident, $sqrt:ident, $ceil:ident, $fmod:ident, $fabs:ident) => {
         impl Scalar for $float {
             const ZERO: Self = 0.0;
             const ONE: Self = 1.0;
@@ -104,6 +115,10 @@ macro_rules! scalar {
                 libm::$ceil(self)
             }
             #[inline]
+            fn rem(self, divisor: Self) -> Self {
+                libm::$fmod(self, divisor)
+            }
+            #[inline]
             fn abs(self) -> Self {
                 libm::$fabs(self)
             }
@@ -115,5 +130,5 @@ macro_rules! scalar {
     };
 }
 
-scalar!(f32, sincosf, atan2f, sqrtf, ceilf, fabsf);
-scalar!(f64, sincos, atan2, sqrt, ceil, fabs);
+scalar!(f32, sincosf, atan2f, sqrtf, ceilf, fmodf, fabsf);
+scalar!(f64, sincos, atan2, sqrt, ceil, fmod, fabs);

@@ -6,8 +6,8 @@
 //! φ'   = r/L (ω_r − ω_l)
 //! ```
 //!
-//! State and outputs: x, y [m], φ [rad], counter-clockwise and unwrapped. Inputs: ω_r, ω_l
-//! [rad/s], the speeds of the right and the left wheel.
+//! State and outputs: x, y (m), φ (rad), counter-clockwise and unwrapped. Inputs: ω_r, ω_l
+//! (rad/s), the speeds of the right and the left wheel.
 //!
 //! # Exact motion
 //!
@@ -22,19 +22,16 @@ use crate::sinc::sinc;
 /// What fixes a differential drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DriveParameters {
-    /// Wheel radius r [m].
+    /// Wheel radius r (m).
     pub wheel_radius_m: f64,
-    /// Distance L between the wheels [m].
+    /// Distance L between the wheels (m).
     pub track_m: f64,
 }
 
 impl Default for DriveParameters {
     /// The paper's ROSbot 2.0: r = 0.062 m, L = 0.228 m.
     fn default() -> Self {
-        Self {
-            wheel_radius_m: 0.062,
-            track_m: 0.228,
-        }
+        Self { wheel_radius_m: 0.062, track_m: 0.228 }
     }
 }
 
@@ -72,7 +69,7 @@ pub enum DriveError {
 pub struct Drive {
     parameters: DriveParameters,
     integrator: Integrator,
-    /// x [m], y [m], φ [rad].
+    /// x (m), y (m), φ (rad).
     pose: [f64; 3],
 }
 
@@ -83,32 +80,24 @@ impl Drive {
     ///
     /// [`DriveError::NotPositive`] if a length is not a finite number above zero.
     pub fn new(parameters: DriveParameters, integrator: Integrator) -> Result<Self, DriveError> {
-        for (field, value) in [
-            ("wheel_radius_m", parameters.wheel_radius_m),
-            ("track_m", parameters.track_m),
-        ] {
+        for (field, value) in
+            [("wheel_radius_m", parameters.wheel_radius_m), ("track_m", parameters.track_m)]
+        {
             if !(value.is_finite() && value > 0.0) {
                 return Err(DriveError::NotPositive { field, value });
             }
         }
-        Ok(Self {
-            parameters,
-            integrator,
-            pose: [0.0; 3],
-        })
+        Ok(Self { parameters, integrator, pose: [0.0; 3] })
     }
 
-    /// Puts the robot at the pose x [m], y [m], φ [rad].
+    /// Puts the robot at the pose x (m), y (m), φ (rad).
     pub fn set_pose(&mut self, pose: [f64; 3]) {
         self.pose = pose;
     }
 
-    /// Forward speed [m/s] and turn rate [rad/s] for the wheel speeds ω_r, ω_l [rad/s].
+    /// Forward speed (m/s) and turn rate (rad/s) for the wheel speeds ω_r, ω_l (rad/s).
     fn twist(&self, [right, left]: [f64; 2]) -> [f64; 2] {
-        let DriveParameters {
-            wheel_radius_m: r,
-            track_m: l,
-        } = self.parameters;
+        let DriveParameters { wheel_radius_m: r, track_m: l } = self.parameters;
         [r / 2.0 * (right + left), r / l * (right - left)]
     }
 }
@@ -119,10 +108,7 @@ impl Plant<3, 2> for Drive {
     }
 
     fn inputs(&self) -> [Variable; 2] {
-        ["omega_r", "omega_l"].map(|name| Variable {
-            name,
-            unit: "radps",
-        })
+        ["omega_r", "omega_l"].map(|name| Variable { name, unit: "radps" })
     }
 
     fn reset(&mut self) {
@@ -131,24 +117,15 @@ impl Plant<3, 2> for Drive {
 
     fn step(&mut self, input: &[f64; 2], dt_s: f64) {
         let [speed, turn_rate] = self.twist(*input);
-        let rate = |&[_, _, phi]: &[f64; 3]| {
-            [
-                speed * libm::cos(phi),
-                speed * libm::sin(phi),
-                turn_rate,
-            ]
-        };
+        let rate =
+            |&[_, _, phi]: &[f64; 3]| [speed * libm::cos(phi), speed * libm::sin(phi), turn_rate];
         self.pose = match self.integrator {
             Integrator::Exact => {
                 let [x, y, phi] = self.pose;
                 let turn = turn_rate * dt_s;
                 let chord = speed * dt_s * sinc(turn / 2.0);
                 let direction = phi + turn / 2.0;
-                [
-                    x + chord * libm::cos(direction),
-                    y + chord * libm::sin(direction),
-                    phi + turn,
-                ]
+                [x + chord * libm::cos(direction), y + chord * libm::sin(direction), phi + turn]
             }
             Integrator::Numerical(method) => method.integrate(self.pose, dt_s, rate),
         };
@@ -243,10 +220,7 @@ mod tests {
     #[test]
     fn lengths_must_be_above_zero() {
         for bad in [0.0, -0.1, f64::NAN, f64::INFINITY] {
-            let parameters = DriveParameters {
-                track_m: bad,
-                ..Default::default()
-            };
+            let parameters = DriveParameters { track_m: bad, ..Default::default() };
             let error = Drive::new(parameters, Integrator::Exact).unwrap_err();
             assert!(error.to_string().starts_with("track_m must be finite"));
         }

@@ -6,12 +6,12 @@ use std::ops::RangeInclusive;
 
 /// The random signal on every input of a robot, independent from input to input.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Signal {
+pub(crate) enum Signal {
     /// A new level from N(0, `std`²) for every sample, clipped to ±`limit`.
     Gaussian {
         /// Standard deviation, in the unit of the input.
         std: f64,
-        /// Largest size, in the unit of the input; infinite for no limit.
+        /// Largest size, in the unit of the input, above 0; infinite for no limit.
         limit: f64,
     },
     /// Levels held for a random number of samples.
@@ -20,7 +20,7 @@ pub enum Signal {
         limit: f64,
         /// Share of the levels that are exactly 0 instead.
         zero_share: f64,
-        /// Samples for which a level is held, uniform.
+        /// Samples for which a level is held, uniform; not empty.
         hold: RangeInclusive<u32>,
     },
 }
@@ -29,21 +29,8 @@ pub enum Signal {
 ///
 /// Levels are rounded to a fixed number of decimals, as a command on a serial line is: what a log
 /// shows is then exactly what acted.
-///
-/// ```
-/// use firmware_sim::excitation::{Excitation, Signal};
-/// use rand::SeedableRng;
-///
-/// let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
-/// let signal = Signal::Steps { limit: 12.0, zero_share: 0.0, hold: 2..=2 };
-/// let mut excitation = Excitation::<1>::new(signal, 2);
-/// let [a, b, c] = std::array::from_fn(|_| excitation.next(&mut rng)[0]);
-/// assert_eq!(a, b);
-/// assert_ne!(b, c);
-/// assert_eq!((100.0 * a).round() / 100.0, a);
-/// ```
 #[derive(Debug, Clone, PartialEq)]
-pub struct Excitation<const INPUTS: usize> {
+pub(crate) struct Excitation<const INPUTS: usize> {
     signal: Signal,
     decimals: u8,
     level: [f64; INPUTS],
@@ -52,28 +39,19 @@ pub struct Excitation<const INPUTS: usize> {
 
 impl<const INPUTS: usize> Excitation<INPUTS> {
     /// The signal from its beginning, rounded to `decimals` decimals.
-    pub fn new(signal: Signal, decimals: u8) -> Self {
-        Self {
-            signal,
-            decimals,
-            level: [0.0; INPUTS],
-            samples_left: [0; INPUTS],
-        }
+    pub(crate) fn new(signal: Signal, decimals: u8) -> Self {
+        Self { signal, decimals, level: [0.0; INPUTS], samples_left: [0; INPUTS] }
     }
 
     /// The input over the next sample.
-    pub fn next(&mut self, rng: &mut impl Rng) -> [f64; INPUTS] {
+    pub(crate) fn next(&mut self, rng: &mut impl Rng) -> [f64; INPUTS] {
         for (level, samples_left) in self.level.iter_mut().zip(&mut self.samples_left) {
             if *samples_left == 0 {
                 let (drawn, hold) = match &self.signal {
                     Signal::Gaussian { std, limit } => {
                         ((std * standard_normal(rng)).clamp(-limit, *limit), 1)
                     }
-                    Signal::Steps {
-                        limit,
-                        zero_share,
-                        hold,
-                    } => {
+                    Signal::Steps { limit, zero_share, hold } => {
                         let is_zero = rng.random::<f64>() < *zero_share;
                         let drawn = limit * (2.0 * rng.random::<f64>() - 1.0);
                         let samples = rng.random_range(hold.clone());
@@ -97,11 +75,7 @@ pub(crate) fn round_to(value: f64, decimals: u8) -> f64 {
     const WHOLE: f64 = 9_007_199_254_740_992.0;
     let scale = (0..decimals).fold(1.0, |power, _| power * 10.0);
     let scaled = value * scale;
-    if scaled.abs() < WHOLE {
-        scaled.round() / scale + 0.0
-    } else {
-        value
-    }
+    if scaled.abs() < WHOLE { scaled.round() / scale + 0.0 } else { value }
 }
 
 #[cfg(test)]
@@ -123,10 +97,7 @@ mod tests {
     #[test]
     fn gaussian_levels_are_clipped_and_change_every_sample() {
         let mut rng = ChaCha8Rng::seed_from_u64(7);
-        let signal = Signal::Gaussian {
-            std: 9.0,
-            limit: 10.0,
-        };
+        let signal = Signal::Gaussian { std: 9.0, limit: 10.0 };
         let mut excitation = Excitation::<2>::new(signal, 3);
         let samples: Vec<_> = (0..1000).map(|_| excitation.next(&mut rng)).collect();
         assert!(samples.iter().flatten().all(|u| u.abs() <= 10.0));
@@ -140,11 +111,7 @@ mod tests {
     #[test]
     fn steps_keep_their_hold_times_and_their_share_of_zeros() {
         let mut rng = ChaCha8Rng::seed_from_u64(7);
-        let signal = Signal::Steps {
-            limit: 12.0,
-            zero_share: 0.2,
-            hold: 4..=20,
-        };
+        let signal = Signal::Steps { limit: 12.0, zero_share: 0.2, hold: 4..=20 };
         let mut excitation = Excitation::<1>::new(signal, 2);
         let levels: Vec<f64> = (0..24_000).map(|_| excitation.next(&mut rng)[0]).collect();
         let runs: Vec<&[f64]> = levels.chunk_by(|a, b| a == b).collect();

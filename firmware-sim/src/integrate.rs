@@ -44,13 +44,9 @@ pub enum Numerical {
 
 impl Numerical {
     /// RK4 with the 10 sub-steps that `rk4` alone means.
-    pub const RK4: Self = Self::Rk4 {
-        substeps: NonZeroU32::new(10).unwrap(),
-    };
+    pub const RK4: Self = Self::Rk4 { substeps: NonZeroU32::new(10).unwrap() };
     /// One Euler step per sample, as in the paper.
-    pub const EULER: Self = Self::Euler {
-        substeps: NonZeroU32::MIN,
-    };
+    pub const EULER: Self = Self::Euler { substeps: NonZeroU32::MIN };
 
     /// The state `dt` after `x`, for x' = `rate`(x) with the held input inside it.
     ///

@@ -11,7 +11,6 @@
 //! | [`drive`] | differential drive (ROSbot), the paper's system (drive) |
 //! | [`arm`] | two-revolute-joint arm, the paper's system (arm) |
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
-//! | [`excitation`] | seeded input signals |
 //! | [`record`] | logs as CSV, one file per trajectory |
 //!
 //! "The paper" is L. Shi and K. Karydis, "ACD-EDMD: Analytical Construction for Dictionaries of
@@ -41,7 +40,7 @@
 
 pub mod arm;
 pub mod drive;
-pub mod excitation;
+mod excitation;
 pub mod integrate;
 mod normal;
 pub mod plant;

@@ -1,2 +1,86 @@
-//! sim
-fn main() {}
+//! The command `firmware-sim`.
+
+use clap::{Parser, Subcommand};
+use firmware_sim::Integrator;
+use firmware_sim::record::{Recording, Robot, Settings};
+use std::error::Error;
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Simulated robots.
+#[derive(Parser)]
+#[command(version)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Records logs of a robot under random inputs, one CSV file per trial.
+    ///
+    /// Writes DIR/trial-000.csv, DIR/trial-001.csv, … with the header time_s,<states>,<inputs>. The
+    /// input in a row acts until the next row. The same options give the same bytes.
+    ///
+    /// ROBOT is one of
+    ///   rosbot        differential drive: x, y, phi; wheel speeds N(0, 9²) within ±32 rad/s; 10 Hz
+    ///   two-link-arm  two joints: angles and rates; torques N(0, 1) Nm; 100 Hz
+    ///   soft-leg      invented soft pneumatic leg: tip y, z; valve voltages held 0.2 s to 1 s; 20 Hz
+    #[command(verbatim_doc_comment, allow_negative_numbers = true)]
+    Record {
+        /// rosbot, two-link-arm or soft-leg
+        robot: Robot,
+        /// Number of trajectories
+        #[arg(long, value_name = "N")]
+        trials: u32,
+        /// Duration of each trajectory; a part of a sample at its end is left out
+        #[arg(long, value_name = "S")]
+        seconds: f64,
+        /// Seed of the inputs and the noise
+        #[arg(long, value_name = "K")]
+        seed: u64,
+        /// Directory for the logs, made if it does not exist
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Add measurement noise of SCALE times the usual size (1 if SCALE is left out)
+        ///
+        /// Usual sizes: rosbot 1 mm and 2 mrad, two-link-arm 0.2 mrad and 5 mrad/s, soft-leg 0.1 mm.
+        #[arg(long, value_name = "SCALE", num_args = 0..=1, default_value = "0", default_missing_value = "1", hide_default_value = true)]
+        noise: f64,
+        /// exact (rosbot only), rk4 or euler (not soft-leg); rk4:N or euler:N for N steps per sample
+        ///
+        /// Without it: exact for the rosbot, rk4 for the others. rk4 means rk4:10, euler means euler:1.
+        #[arg(long, value_name = "METHOD")]
+        integrator: Option<Integrator>,
+        /// Decimals of the measured columns
+        ///
+        /// Without it: every digit, or with noise 6 (soft-leg 4).
+        #[arg(long, value_name = "N")]
+        digits: Option<u8>,
+        /// Replace a recording that DIR already holds
+        #[arg(long)]
+        overwrite: bool,
+    },
+}
+
+fn main() -> ExitCode {
+    match run(Arguments::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            // Nothing is left to say it with if this fails too.
+            let _ = writeln!(std::io::stderr(), "error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: Arguments) -> Result<(), Box<dyn Error>> {
+    let Command::Record { robot, trials, seconds, seed, out, noise, integrator, digits, overwrite } =
+        arguments.command;
+    let recording =
+        Recording::new(Settings { robot, trials, seconds, seed, noise, integrator, digits })?;
+    recording.write(&out, overwrite)?;
+    writeln!(std::io::stdout(), "{recording}, in {}", out.display())?;
+    Ok(())
+}

@@ -20,9 +20,9 @@
 
 use std::collections::HashSet;
 use std::ffi::OsStr;
-use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, Read};
+use std::mem;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -31,6 +31,8 @@ use thiserror::Error;
 
 /// Size of the read buffer, in bytes; also the grain of [`Visitor::progress`].
 const BUFFER_BYTES: usize = 1 << 16;
+
+const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
 
 /// Longest line accepted, in bytes: a file without line ends must not fill the memory.
 const MAX_LINE_BYTES: u64 = 1 << 20;
@@ -62,12 +64,7 @@ pub struct LogColumn {
 impl LogColumn {
     /// A column found by its name and unit, read as it stands (factor 1).
     pub fn new(name: impl Into<String>, unit: impl Into<String>) -> Self {
-        Self {
-            name: name.into(),
-            unit: unit.into(),
-            column: None,
-            factor: 1.0,
-        }
+        Self { name: name.into(), unit: unit.into(), column: None, factor: 1.0 }
     }
 
     /// The headers under which this quantity may stand.
@@ -103,23 +100,21 @@ pub struct LogSchema {
 impl LogSchema {
     /// A schema with the time in `time_s` and one trajectory per file.
     pub fn new(sample_time_s: f64, states: Vec<LogColumn>, inputs: Vec<LogColumn>) -> Self {
-        Self {
-            sample_time_s,
-            time: "time_s".into(),
-            episode: None,
-            states,
-            inputs,
-        }
+        Self { sample_time_s, time: "time_s".into(), episode: None, states, inputs }
     }
 }
 
 /// The suffix of a column header that stands for a unit: `/` becomes `p`, and whatever else is
-/// not alphanumeric is left out. `m` → `m`, `rad/s` → `radps`, `N m` → `Nm`.
+/// not alphanumeric is left out.
+///
+/// ```
+/// use trainer::recording::unit_suffix;
+///
+/// assert_eq!(unit_suffix("rad/s"), "radps");
+/// assert_eq!(unit_suffix("N m"), "Nm");
+/// ```
 pub fn unit_suffix(unit: &str) -> String {
-    unit.chars()
-        .map(|c| if c == '/' { 'p' } else { c })
-        .filter(|c| c.is_alphanumeric())
-        .collect()
+    unit.chars().map(|c| if c == '/' { 'p' } else { c }).filter(|c| c.is_alphanumeric()).collect()
 }
 
 /// Receives the rows of a recording, in order.
@@ -460,10 +455,7 @@ pub enum ReadError {
 
 fn step_message(fault: StepFault, found_s: f64, expected_s: f64, logs: &Path) -> String {
     let found = nanoseconds(found_s);
-    let command = format!(
-        "`trainer resample {} --dt {expected_s} --out DIR`",
-        shell_word(logs)
-    );
+    let command = format!("`trainer resample {} --dt {expected_s} --out DIR`", shell_word(logs));
     match fault {
         StepFault::StandsStill => format!(
             "the time stands still: expected a step of {expected_s} s ± 5 %, found {found} s; \
@@ -520,10 +512,8 @@ impl Recording {
     /// [`RecordingError`] if the path does not exist or cannot be listed, holds no log, or
     /// something that is not a regular file has the name of one.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
-        let unreadable = |path: &Path, source| RecordingError::Unreadable {
-            path: path.to_owned(),
-            source,
-        };
+        let unreadable =
+            |path: &Path, source| RecordingError::Unreadable { path: path.to_owned(), source };
         let kind = match fs::metadata(path) {
             Err(source) if source.kind() == io::ErrorKind::NotFound => {
                 return Err(RecordingError::NotFound { path: path.into() });
@@ -558,11 +548,7 @@ impl Recording {
             }
             bytes += facts.len();
         }
-        Ok(Self {
-            path: path.to_owned(),
-            files,
-            bytes,
-        })
+        Ok(Self { path: path.to_owned(), files, bytes })
     }
 
     /// The path that was opened.
@@ -592,6 +578,33 @@ impl Recording {
     /// Streams all rows, file after file, to `visitor`. Every step in time must be within 5 %
     /// of the sample time.
     ///
+    /// ```
+    /// use trainer::recording::{LogColumn, LogSchema, Recording, Visitor};
+    ///
+    /// #[derive(Default)]
+    /// struct Headings(Vec<f64>);
+    ///
+    /// impl Visitor for Headings {
+    ///     fn begin(&mut self, name: &str) {
+    ///         assert_eq!(name, "run");
+    ///     }
+    ///     fn row(&mut self, states: &[f64], _inputs: &[f64]) {
+    ///         self.0.push(states[0]);
+    ///     }
+    /// }
+    ///
+    /// let dir = tempfile::tempdir()?;
+    /// std::fs::write(dir.path().join("run.csv"), "time_s,theta_deg\n0,0\n0.1,180\n")?;
+    ///
+    /// let theta = LogColumn { factor: 1f64.to_radians(), ..LogColumn::new("theta", "deg") };
+    /// let schema = LogSchema::new(0.1, vec![theta], vec![]);
+    /// let mut headings = Headings::default();
+    /// let summary = Recording::open(dir.path())?.read(&schema, &mut headings)?;
+    /// assert_eq!(headings.0, [0.0, std::f64::consts::PI]);
+    /// assert_eq!((summary.trajectories, summary.rows), (1, 2));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
     /// # Errors
     ///
     /// [`ReadError`] at the first fault. The visitor has then seen the rows before it, and
@@ -603,9 +616,7 @@ impl Recording {
     ) -> Result<Summary, ReadError> {
         let expected_s = schema.sample_time_s;
         if !(expected_s.is_finite() && expected_s > 0.0) {
-            return Err(ReadError::SampleTime {
-                found_s: expected_s,
-            });
+            return Err(ReadError::SampleTime { found_s: expected_s });
         }
         let mut last_s = 0.0;
         let mut reported = 0;
@@ -665,17 +676,12 @@ impl Recording {
             bytes_before += source.bytes;
             hasher = source.hasher;
         }
-        Ok(Summary {
-            trajectories,
-            rows,
-            sha256: hasher.finalize().into(),
-        })
+        Ok(Summary { trajectories, rows, sha256: hasher.finalize().into() })
     }
 }
 
 fn is_csv(path: &Path) -> bool {
-    path.extension()
-        .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
+    path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
 }
 
 fn step_fault(last_s: f64, time_s: f64, expected_s: f64) -> Option<StepFault> {
@@ -736,31 +742,25 @@ struct Lines<'a> {
     length: u64,
     input: BufReader<HashedFile>,
     line: u64,
-    text: Vec<u8>,
+    /// The line without its end, and with U+FFFD in the place of what is not UTF-8.
+    text: String,
     /// Where the fields are in `text`.
     fields: Vec<Range<usize>>,
 }
 
 impl<'a> Lines<'a> {
     fn open(file: &'a Path, mut hasher: Sha256) -> Result<Self, ReadError> {
-        let unreadable = |source| ReadError::Unreadable {
-            file: file.to_owned(),
-            source,
-        };
+        let unreadable = |source| ReadError::Unreadable { file: file.to_owned(), source };
         let input = File::open(file).map_err(unreadable)?;
         let length = input.metadata().map_err(unreadable)?.len();
         hasher.update(length.to_le_bytes());
-        let input = HashedFile {
-            file: input,
-            hasher,
-            bytes: 0,
-        };
+        let input = HashedFile { file: input, hasher, bytes: 0 };
         Ok(Self {
             file,
             length,
             input: BufReader::with_capacity(BUFFER_BYTES, input),
             line: 0,
-            text: Vec::new(),
+            text: String::new(),
             fields: Vec::new(),
         })
     }
@@ -768,16 +768,12 @@ impl<'a> Lines<'a> {
     /// Moves to the next line that is not blank; `false` at the end of the file.
     fn advance(&mut self) -> Result<bool, ReadError> {
         loop {
-            self.text.clear();
-            let length = self
-                .input
-                .by_ref()
-                .take(MAX_LINE_BYTES + 1)
-                .read_until(b'\n', &mut self.text)
-                .map_err(|source| ReadError::Unreadable {
-                    file: self.file.to_owned(),
-                    source,
-                })?;
+            let mut text = mem::take(&mut self.text).into_bytes();
+            text.clear();
+            let length =
+                self.input.by_ref().take(MAX_LINE_BYTES + 1).read_until(b'\n', &mut text).map_err(
+                    |source| ReadError::Unreadable { file: self.file.to_owned(), source },
+                )?;
             if length == 0 {
                 let found = self.input.get_ref().bytes;
                 if found != self.length {
@@ -797,10 +793,13 @@ impl<'a> Lines<'a> {
                     limit: MAX_LINE_BYTES,
                 });
             }
-            if self.line == 1 && self.text.starts_with("\u{feff}".as_bytes()) {
-                self.text.drain(.."\u{feff}".len());
+            if self.line == 1 && text.starts_with(BYTE_ORDER_MARK) {
+                text.drain(..BYTE_ORDER_MARK.len());
             }
-            if !self.text.trim_ascii_start().is_empty() {
+            text.truncate(text.trim_ascii_end().len());
+            self.text = String::from_utf8(text)
+                .unwrap_or_else(|odd| String::from_utf8_lossy(odd.as_bytes()).into_owned());
+            if !self.text.is_empty() {
                 self.split();
                 return Ok(true);
             }
@@ -810,63 +809,76 @@ impl<'a> Lines<'a> {
     /// Finds the fields of `text`. Plain lines, which is nearly all of them, are split in place.
     fn split(&mut self) {
         self.fields.clear();
-        if self.text.contains(&b'"') {
-            let mut record = csv::ByteRecord::new();
-            let read = csv::ReaderBuilder::new()
-                .has_headers(false)
-                .buffer_capacity(self.text.len())
-                .from_reader(self.text.as_slice())
-                .read_byte_record(&mut record);
-            if let Ok(true) = read {
-                self.fields
-                    .extend((0..record.len()).filter_map(|field| record.range(field)));
-                self.text.clear();
-                self.text.extend_from_slice(record.as_slice());
-                return;
-            }
-        }
         let mut start = 0;
-        for (end, byte) in self.text.iter().enumerate() {
-            if *byte == b',' {
+        let mut quotes = 0;
+        let (words, rest) = self.text.as_bytes().as_chunks::<8>();
+        let mut last = [0; 8];
+        last[..rest.len()].copy_from_slice(rest);
+        for (index, word) in words.iter().chain([&last]).enumerate() {
+            quotes |= occurrences(*word, b'"');
+            let mut commas = occurrences(*word, b',');
+            while commas != 0 {
+                let end = 8 * index + commas.trailing_zeros() as usize / 8;
                 self.fields.push(start..end);
                 start = end + 1;
+                commas &= commas - 1;
             }
         }
-        let end = self.text.trim_ascii_end().len().max(start);
-        self.fields.push(start..end);
+        self.fields.push(start..self.text.len());
+        if quotes != 0 {
+            self.split_quoted();
+        }
     }
 
-    fn field(&self, field: usize) -> &[u8] {
+    fn split_quoted(&mut self) {
+        let mut record = csv::StringRecord::new();
+        let read = csv::ReaderBuilder::new()
+            .has_headers(false)
+            .buffer_capacity(self.text.len())
+            .from_reader(self.text.as_bytes())
+            .read_record(&mut record);
+        // Any text is a record; should csv see it otherwise, the plain fields stand.
+        if let Ok(true) = read {
+            self.fields.clear();
+            self.fields.extend((0..record.len()).filter_map(|field| record.range(field)));
+            self.text.clear();
+            self.text.push_str(record.as_slice());
+        }
+    }
+
+    fn field(&self, field: usize) -> &str {
         &self.text[self.fields[field].clone()]
     }
 
     /// Reads the header.
     fn header(&mut self) -> Result<Vec<String>, ReadError> {
         if !self.advance()? {
-            return Err(ReadError::Empty {
-                file: self.file.to_owned(),
-            });
+            return Err(ReadError::Empty { file: self.file.to_owned() });
         }
-        let header: Vec<String> = (0..self.fields.len())
-            .map(|field| String::from_utf8_lossy(self.field(field).trim_ascii()).into_owned())
-            .collect();
+        let header: Vec<String> =
+            (0..self.fields.len()).map(|field| self.field(field).trim().to_owned()).collect();
         if let [only] = header.as_slice()
             && let Some(found) = [';', '\t'].into_iter().find(|c| only.contains(*c))
         {
-            return Err(ReadError::Separator {
-                file: self.file.to_owned(),
-                found,
-            });
+            return Err(ReadError::Separator { file: self.file.to_owned(), found });
         }
         Ok(header)
     }
 }
 
+/// Marks the bytes of `word` that equal `byte` by their highest bit, the first byte lowest: eight
+/// comparisons at once.
+fn occurrences(word: [u8; 8], byte: u8) -> u64 {
+    const LOW_BITS: u64 = u64::from_le_bytes([0x7f; 8]);
+    let difference = u64::from_le_bytes(word) ^ u64::from_le_bytes([byte; 8]);
+    !(((difference & LOW_BITS) + LOW_BITS) | difference | LOW_BITS)
+}
+
 /// Where an episode column stands and which episodes have been seen.
 struct Episodes {
     field: usize,
-    current: Vec<u8>,
-    seen: HashSet<Box<[u8]>>,
+    current: String,
+    seen: HashSet<Box<str>>,
 }
 
 /// One log file, read row by row according to a schema.
@@ -901,7 +913,7 @@ impl<'a> Log<'a> {
             None => None,
             Some(column) => Some(Episodes {
                 field: find("episode", vec![column.clone()])?,
-                current: Vec::new(),
+                current: String::new(),
                 seen: HashSet::new(),
             }),
         };
@@ -924,9 +936,7 @@ impl<'a> Log<'a> {
         if !self.lines.advance()? {
             self.end_trajectory()?;
             return match self.rows {
-                0 => Err(ReadError::NoRows {
-                    file: self.lines.file.to_owned(),
-                }),
+                0 => Err(ReadError::NoRows { file: self.lines.file.to_owned() }),
                 _ => Ok(None),
             };
         }
@@ -967,26 +977,11 @@ impl<'a> Log<'a> {
         let column = self.header[field].clone();
         let found = excerpt(self.lines.field(field));
         if found.is_empty() {
-            ReadError::EmptyField {
-                file,
-                line,
-                column,
-                expected: "a number",
-            }
+            ReadError::EmptyField { file, line, column, expected: "a number" }
         } else if is_number {
-            ReadError::NotFinite {
-                file,
-                line,
-                column,
-                found,
-            }
+            ReadError::NotFinite { file, line, column, found }
         } else {
-            ReadError::NotANumber {
-                file,
-                line,
-                column,
-                found,
-            }
+            ReadError::NotANumber { file, line, column, found }
         }
     }
 
@@ -995,7 +990,7 @@ impl<'a> Log<'a> {
         let Some(episodes) = &mut self.episodes else {
             return Ok(false);
         };
-        let label = self.lines.field(episodes.field).trim_ascii();
+        let label = self.lines.field(episodes.field).trim();
         if label == episodes.current && !label.is_empty() {
             return Ok(false);
         }
@@ -1011,15 +1006,10 @@ impl<'a> Log<'a> {
             });
         }
         if !episodes.seen.insert(label.into()) {
-            return Err(ReadError::EpisodeReturns {
-                file,
-                line,
-                column,
-                episode: excerpt(label),
-            });
+            return Err(ReadError::EpisodeReturns { file, line, column, episode: excerpt(label) });
         }
         episodes.current.clear();
-        episodes.current.extend_from_slice(label);
+        episodes.current.push_str(label);
         Ok(true)
     }
 
@@ -1028,9 +1018,8 @@ impl<'a> Log<'a> {
         self.trajectory.clear();
         self.trajectory.push_str(&stem.to_string_lossy());
         if let Some(episodes) = &self.episodes {
-            let label = String::from_utf8_lossy(&episodes.current);
-            // Writing to a string cannot fail.
-            let _ = write!(self.trajectory, "#{label}");
+            self.trajectory.push('#');
+            self.trajectory.push_str(&episodes.current);
         }
     }
 
@@ -1052,9 +1041,8 @@ fn find_column(
     quantity: &str,
     looked_for: Vec<String>,
 ) -> Result<usize, ReadError> {
-    let fits: Vec<usize> = (0..header.len())
-        .filter(|field| looked_for.contains(&header[*field]))
-        .collect();
+    let fits: Vec<usize> =
+        (0..header.len()).filter(|field| looked_for.contains(&header[*field])).collect();
     let file = file.to_owned();
     match fits[..] {
         [field] => Ok(field),
@@ -1079,16 +1067,441 @@ fn find_column(
 }
 
 /// The number in a field, spaces around it ignored. NaN and the infinities are numbers here.
-fn number(field: &[u8]) -> Option<f64> {
-    let parse = |text| std::str::from_utf8(text).ok()?.parse().ok();
-    parse(field).or_else(|| parse(field.trim_ascii()))
+fn number(field: &str) -> Option<f64> {
+    field.parse().or_else(|_| field.trim().parse()).ok()
 }
 
 /// A field as it is shown in a message: at most 40 characters, on one line.
-fn excerpt(field: &[u8]) -> String {
-    let text = String::from_utf8_lossy(field.trim_ascii()).replace(char::is_control, "\u{fffd}");
+fn excerpt(field: &str) -> String {
+    let text = field.trim().replace(char::is_control, "\u{fffd}");
     match text.char_indices().nth(40) {
         Some((end, _)) => format!("{}…", &text[..end]),
         None => text,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tempfile::TempDir;
+
+    /// Keeps everything it is shown.
+    #[derive(Debug, Default)]
+    struct Seen {
+        names: Vec<String>,
+        rows: Vec<Vec<f64>>,
+        progress: Vec<u64>,
+        addresses: HashSet<usize>,
+    }
+
+    impl Visitor for Seen {
+        fn begin(&mut self, name: &str) {
+            self.names.push(name.into());
+        }
+        fn row(&mut self, states: &[f64], inputs: &[f64]) {
+            self.addresses.insert(states.as_ptr().addr());
+            self.rows.push([states, inputs].concat());
+        }
+        fn progress(&mut self, bytes_read: u64) {
+            self.progress.push(bytes_read);
+        }
+    }
+
+    fn logs(files: &[(&str, &str)]) -> TempDir {
+        let dir = TempDir::new().unwrap();
+        for (name, text) in files {
+            fs::write(dir.path().join(name), text).unwrap();
+        }
+        dir
+    }
+
+    /// One state `x` in metres, one input `u` without a unit, a row every 0.1 s.
+    fn schema() -> LogSchema {
+        LogSchema::new(0.1, vec![LogColumn::new("x", "m")], vec![LogColumn::new("u", "")])
+    }
+
+    fn read_with(text: &str, schema: &LogSchema) -> Result<(Seen, Summary), ReadError> {
+        let dir = logs(&[("run.csv", text)]);
+        let mut seen = Seen::default();
+        let summary = Recording::open(dir.path()).unwrap().read(schema, &mut seen)?;
+        Ok((seen, summary))
+    }
+
+    fn read(text: &str) -> Result<(Seen, Summary), ReadError> {
+        read_with(text, &schema())
+    }
+
+    fn episodes(text: &str) -> Result<(Seen, Summary), ReadError> {
+        read_with(text, &LogSchema { episode: Some("run".into()), ..schema() })
+    }
+
+    /// The message without the directory of the log, which is another one in every test run.
+    #[track_caller]
+    fn message(result: Result<(Seen, Summary), ReadError>) -> String {
+        let text = result.unwrap_err().to_string();
+        assert!(!text.contains('\n'), "one line: {text}");
+        text[text.find("run.csv").expect("the message names the file")..].to_owned()
+    }
+
+    #[test]
+    fn rows_arrive_in_order_in_the_same_memory() {
+        let text = "time_s,x_m,u\n0,1,-1\n0.1,2,-2\n0.2,3,-3\n";
+        let (seen, summary) = read(text).unwrap();
+        assert_eq!(seen.names, ["run"]);
+        assert_eq!(seen.rows, [[1.0, -1.0], [2.0, -2.0], [3.0, -3.0]]);
+        assert_eq!(seen.addresses.len(), 1);
+        assert_eq!(seen.progress, [text.len() as u64]);
+        assert_eq!((summary.trajectories, summary.rows), (1, 3));
+    }
+
+    #[test]
+    fn progress_ends_at_the_size_of_the_recording() {
+        let mut text = String::from("time_s,x,u\n");
+        for k in 0..20_000 {
+            text += &format!("{},{k},0\n", f64::from(k) / 10.0);
+        }
+        let dir = logs(&[("a.csv", &text), ("b.csv", &text)]);
+        let recording = Recording::open(dir.path()).unwrap();
+        let mut seen = Seen::default();
+        let summary = recording.read(&schema(), &mut seen).unwrap();
+        assert_eq!((summary.trajectories, summary.rows), (2, 40_000));
+        assert_eq!(recording.bytes(), 2 * text.len() as u64);
+        assert_eq!(seen.progress.last(), Some(&recording.bytes()));
+        assert!(seen.progress.is_sorted() && seen.progress.len() > 4);
+        assert_eq!(seen.addresses.len(), 2, "one row of memory per file");
+    }
+
+    #[test]
+    fn files_are_sorted_by_the_bytes_of_their_names() {
+        let text = "time_s,x,u\n0,0,0\n0.1,0,0\n";
+        let names = ["b.csv", "a10.csv", "a2.csv", "B.csv", "Z.CSV", "robot.toml", ".hidden.csv"];
+        let dir = logs(&names.map(|name| (name, text)));
+        fs::create_dir(dir.path().join("inner")).unwrap();
+        let recording = Recording::open(dir.path()).unwrap();
+        let found: Vec<_> = recording.files().iter().map(|f| f.file_name().unwrap()).collect();
+        assert_eq!(found, ["B.csv", "Z.CSV", "a10.csv", "a2.csv", "b.csv"]);
+        assert_eq!(recording.path(), dir.path());
+        assert_eq!(recording.columns().unwrap(), ["time_s", "x", "u"]);
+
+        let one = Recording::open(&dir.path().join("b.csv")).unwrap();
+        assert_eq!(one.files(), [dir.path().join("b.csv")]);
+    }
+
+    #[test]
+    fn the_digest_covers_lengths_and_bytes() {
+        let (a, b) = ("time_s,x,u\n0,0,0\n0.1,0,0\n", "time_s,x,u\r\n0,0,0\r\n0.1,1,0");
+        let dir = logs(&[("a.csv", a), ("b.csv", b)]);
+        let recording = Recording::open(dir.path()).unwrap();
+        let summary = recording.read(&schema(), &mut Seen::default()).unwrap();
+        let mut bytes = Vec::new();
+        for text in [a, b] {
+            bytes.extend((text.len() as u64).to_le_bytes());
+            bytes.extend(text.as_bytes());
+        }
+        assert_eq!(summary.sha256, <[u8; 32]>::from(Sha256::digest(&bytes)));
+    }
+
+    #[test]
+    fn byte_order_mark_crlf_blank_lines_spaces_and_quotes_are_accepted() {
+        let plain = read("time_s,x_m,u\n0,1,2\n0.1,3,4\n").unwrap().0.rows;
+        for text in [
+            "\u{feff}time_s,x_m,u\r\n0,1,2\r\n0.1,3,4\r\n\r\n",
+            "time_s,x_m,u\n0,1,2\n\n0.1,3,4",
+            "  time_s , x_m, u \n 0 ,\t1, 2\n0.1, 3, 4 \n \n\t\n\n",
+            "\n\"time_s\",\"x_m\",\"u\"\n\"0\",1,2\n0.1,\"3\",4\n",
+            "time_s,note,x_m,u\n0,\"a, \"\"b\"\"\",1,2\n0.1,,3,4\n",
+        ] {
+            assert_eq!(read(text).unwrap().0.rows, plain, "{text:?}");
+        }
+        let dir = logs(&[]);
+        fs::write(dir.path().join("l.csv"), b"note,time_s,x,u\n\xb0C,0,1,2\n,0.1,3,4\n").unwrap();
+        let mut seen = Seen::default();
+        let recording = Recording::open(dir.path()).unwrap();
+        recording.read(&schema(), &mut seen).unwrap();
+        assert_eq!(seen.rows, plain, "other columns need not be UTF-8");
+    }
+
+    #[test]
+    fn many_columns_are_split_exactly() {
+        // Commas next to every other byte, at every place in a word of eight.
+        let fields: Vec<String> = (0..40).map(|k| "-".to_owned() + &"7".repeat(k % 9)).collect();
+        let dir = logs(&[("a.csv", &fields.join(","))]);
+        assert_eq!(Recording::open(dir.path()).unwrap().columns().unwrap(), fields);
+        let line = ",,-,,+,\u{1},\u{ac},,";
+        let dir = logs(&[("a.csv", line)]);
+        let found = Recording::open(dir.path()).unwrap().columns().unwrap();
+        assert_eq!(found, line.split(',').collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn units_become_suffixes() {
+        for (unit, suffix) in [
+            ("m", "m"),
+            ("rad/s", "radps"),
+            ("m/s", "mps"),
+            ("Nm", "Nm"),
+            ("N m", "Nm"),
+            ("m/s^2", "mps2"),
+            ("", ""),
+        ] {
+            assert_eq!(unit_suffix(unit), suffix);
+        }
+    }
+
+    #[test]
+    fn columns_are_found_by_name_unit_or_header() {
+        for header in ["time_s,u,x", "time_s,u,x_m", "u,X,time_s,x_m", "time_s,u,x,a,a"] {
+            let row = vec!["7"; header.split(',').count()].join(",");
+            let at = |t| {
+                let place = header.split(',').position(|name| name == "time_s").unwrap();
+                let mut row: Vec<&str> = row.split(',').collect();
+                row[place] = t;
+                row.join(",")
+            };
+            let text = format!("{header}\n{}\n{}\n", at("0"), at("0.1"));
+            assert_eq!(read(&text).unwrap().0.rows, [[7.0, 7.0], [7.0, 7.0]], "{header}");
+        }
+        let mut named = schema();
+        named.states[0].column = Some("position [m]".into());
+        named.time = "t".into();
+        let text = "t,x,position [m],u\n0,9,1,2\n.1,9,3,4\n";
+        assert_eq!(read_with(text, &named).unwrap().0.rows, [[1.0, 2.0], [3.0, 4.0]]);
+    }
+
+    #[test]
+    fn degrees_become_radians_by_the_factor() {
+        let mut degrees = schema();
+        degrees.states[0] =
+            LogColumn { factor: 1f64.to_radians(), ..LogColumn::new("theta", "deg") };
+        let (seen, _) = read_with("time_s,theta_deg,u\n0,180,1\n0.1,-90,1\n", &degrees).unwrap();
+        assert_eq!(seen.rows[0], [std::f64::consts::PI, 1.0]);
+        assert_eq!(seen.rows[1], [-std::f64::consts::FRAC_PI_2, 1.0]);
+    }
+
+    #[test]
+    fn header_faults_name_what_was_looked_for_and_found() {
+        assert_eq!(
+            message(read("time_s,y_m,u\n0,0,0\n")),
+            "run.csv, row 1: no column for `x`: looked for `x` or `x_m`, found `time_s`, `y_m`, \
+             `u`; rename the column in the log or name it in robot.toml"
+        );
+        assert_eq!(
+            message(read("time,x_m,u\n0,0,0\n")),
+            "run.csv, row 1: no column for `time`: looked for `time_s`, found `time`, `x_m`, \
+             `u`; rename the column in the log or name it in robot.toml"
+        );
+        assert_eq!(
+            message(read("time_s,x,x_m,u\n0,0,0,0\n")),
+            "run.csv, row 1: two columns could be `x`: `x` and `x_m`; expected one of them; \
+             name the right column in robot.toml or remove the other"
+        );
+        assert_eq!(
+            message(read("time_s,x,u,x\n0,0,0,0\n")),
+            "run.csv, row 1: `x` is the header of columns 2 and 4; expected it once; \
+             rename or remove one of them"
+        );
+        assert!(message(episodes("time_s,x,u\n0,0,0\n")).contains("looked for `run`"));
+        let text = message(read("time_s;x;u\n0;0;0\n"));
+        assert!(
+            text.starts_with("run.csv, row 1: expected columns separated by commas, found ';'")
+        );
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_used_are_named_by_row_and_column() {
+        let with = |field: &str| message(read(&format!("time_s,x_m,u\n0,0,0\n0.1,{field},0\n")));
+        assert_eq!(
+            with("abc"),
+            "run.csv, row 3, column `x_m`: expected a number, found `abc`; \
+             correct the field or delete the row"
+        );
+        assert_eq!(
+            with(" "),
+            "run.csv, row 3, column `x_m`: expected a number, found an empty field; \
+             fill it in or delete the row"
+        );
+        for field in ["NaN", "nan", "inf", "-Infinity", "1e999"] {
+            let start =
+                format!("run.csv, row 3, column `x_m`: expected a finite number, found `{field}`;");
+            assert!(with(field).starts_with(&start), "{}", with(field));
+        }
+        assert!(with(&"9x".repeat(99)).contains(&format!("found `{}…`;", "9x".repeat(20))));
+        assert!(with("0x1\u{7}").contains("found `0x1\u{fffd}`"));
+
+        let text = message(read("time_s,x,u\r\n\r\nzero,0,0\r\n"));
+        assert!(text.starts_with("run.csv, row 3, column `time_s`: expected a number"), "{text}");
+        let text = message(read("time_s,x,u\n0,0,\n"));
+        assert!(text.starts_with("run.csv, row 2, column `u`: expected a number"), "{text}");
+    }
+
+    #[test]
+    fn a_factor_must_not_overflow() {
+        let mut large = schema();
+        large.states[0].factor = 10.0;
+        let text = message(read_with("time_s,x,u\n0,1e308,0\n", &large));
+        assert!(text.contains("row 2, column `x`: expected a finite number"), "{text}");
+    }
+
+    #[test]
+    fn ragged_rows_are_named_by_the_first_column_that_does_not_fit() {
+        let text = message(read("time_s,x,u\n0,0,0\n0.1,0\n"));
+        let start = "run.csv, row 3, column `u`: expected 3 fields as in the header, found 2;";
+        assert!(text.starts_with(start), "{text}");
+        let text = message(read("time_s,x,u\n0,0,0\n0,1,0,0,0\n"));
+        let start = "run.csv, row 3, column `4`: expected 3 fields as in the header, found 5;";
+        assert!(text.starts_with(start), "{text}");
+    }
+
+    #[test]
+    fn short_files_have_a_message_each() {
+        for empty in ["", "\n \r\n", "\u{feff}"] {
+            let text = message(read(empty));
+            assert!(text.starts_with("run.csv: the file is empty;"), "{text}");
+        }
+        let text = message(read("time_s,x,u\n\n"));
+        assert!(text.starts_with("run.csv: the file holds a header but no rows;"), "{text}");
+        let text = message(read("time_s,x,u\n0,0,0\n"));
+        assert!(text.starts_with("run.csv, row 2: trajectory `run` has one row;"), "{text}");
+    }
+
+    #[test]
+    fn a_line_without_end_is_refused() {
+        let text = message(read(&"7".repeat(1 << 21)));
+        assert!(text.starts_with("run.csv, row 1: the line is longer than 1048576 bytes"));
+    }
+
+    #[test]
+    fn episodes_are_trajectories() {
+        let (seen, summary) =
+            episodes("run,time_s,x,u\na,0,1,0\na,0.1,2,0\n b,7,3,0\nb ,7.1,4,0\n").unwrap();
+        assert_eq!(seen.names, ["run#a", "run#b"]);
+        assert_eq!((summary.trajectories, summary.rows), (2, 4));
+
+        // The same label in another file is another trajectory.
+        let text = "run,time_s,x,u\n1,0,0,0\n1,0.1,0,0\n";
+        let dir = logs(&[("a.csv", text), ("b.csv", text)]);
+        let mut seen = Seen::default();
+        let schema = LogSchema { episode: Some("run".into()), ..schema() };
+        Recording::open(dir.path()).unwrap().read(&schema, &mut seen).unwrap();
+        assert_eq!(seen.names, ["a#1", "b#1"]);
+    }
+
+    #[test]
+    fn episode_faults() {
+        let text = message(episodes(
+            "run,time_s,x,u\na,0,0,0\na,0.1,0,0\nb,0,0,0\nb,0.1,0,0\na,0.2,0,0\n",
+        ));
+        let start = "run.csv, row 6, column `run`: episode `a` returns after it had ended;";
+        assert!(text.starts_with(start), "{text}");
+        let text = message(episodes("run,time_s,x,u\na,0,0,0\na,0.1,0,0\nb,0,0,0\nc,0,0,0\n"));
+        assert!(text.starts_with("run.csv, row 4: trajectory `run#b` has one row;"), "{text}");
+        let text = message(episodes("run,time_s,x,u\n,0,0,0\n"));
+        let start = "run.csv, row 2, column `run`: expected the episode's label, found an empty";
+        assert!(text.starts_with(start), "{text}");
+    }
+
+    #[test]
+    fn five_percent_of_jitter_passes() {
+        let with = |times: &[&str], sample_time_s| {
+            let rows: String = times.iter().map(|t| format!("{t},0,0\n")).collect();
+            read_with(&format!("time_s,x,u\n{rows}"), &LogSchema { sample_time_s, ..schema() })
+        };
+        for times in [
+            ["0", "0.105", "0.2"],
+            ["-0.1", "0", "0.095"],
+            ["0.3", "0.4", "0.5"],
+            ["0", "0.102", "0.204"],
+            ["1760000000.1", "1760000000.205", "1760000000.3"],
+        ] {
+            assert!(with(&times, 0.1).is_ok(), "{times:?}");
+        }
+        for times in [["0", "0.10501", "0.2"], ["0", "0.1", "0.19499"]] {
+            assert!(with(&times, 0.1).is_err(), "{times:?}");
+        }
+        for bad in [0.0, -0.1, f64::NAN, f64::INFINITY] {
+            let error = with(&["0", "0.1"], bad).unwrap_err();
+            assert!(matches!(error, ReadError::SampleTime { .. }), "{error}");
+        }
+    }
+
+    #[test]
+    fn time_faults_are_told_apart_and_name_the_command() {
+        let dir = logs(&[]);
+        let file = dir.path().join("run.csv");
+        let with = |time: &str| {
+            fs::write(&file, format!("time_s,x,u\n0.1,0,0\n0.2,0,0\n{time},0,0\n")).unwrap();
+            let recording = Recording::open(dir.path()).unwrap();
+            recording.read(&schema(), &mut Seen::default()).unwrap_err()
+        };
+        for (time, kind, start, step) in [
+            ("0.32", StepFault::Jitter, "the time jitters", "0.12"),
+            ("0.26", StepFault::Jitter, "the time jitters", "0.06"),
+            ("0.5", StepFault::Gap, "a gap in the time", "0.3"),
+            ("0.2", StepFault::StandsStill, "the time stands still", "0"),
+            ("0.1", StepFault::GoesBack, "the time goes backwards", "-0.1"),
+        ] {
+            let error = with(time);
+            let text = error.to_string();
+            let logs = dir.path().display();
+            let start = format!(
+                "{}, row 4, column `time_s`: {start}: expected a step of 0.1 s ± 5 %, \
+                 found {step} s; ",
+                file.display()
+            );
+            assert!(text.starts_with(&start), "{text}");
+            assert!(text.contains(&format!("`trainer resample {logs} --dt 0.1 --out DIR`")));
+            assert!(matches!(error, ReadError::TimeStep { fault, line: 4, .. } if fault == kind));
+        }
+    }
+
+    #[test]
+    fn paths_are_written_as_one_shell_word() {
+        assert_eq!(shell_word(Path::new("models/a-b_1.csv")), "models/a-b_1.csv");
+        assert_eq!(shell_word(Path::new("my logs")), "'my logs'");
+        assert_eq!(shell_word(Path::new("it's")), r"'it'\''s'");
+    }
+
+    #[test]
+    fn paths_that_hold_no_log() {
+        let dir = logs(&[("robot.toml", "")]);
+        let open = |path: &Path| Recording::open(path).unwrap_err();
+        let path = dir.path();
+        let error = open(path);
+        assert!(matches!(&error, RecordingError::NoLogs { path: p } if p == path));
+        let start = format!("{}: the directory holds no .csv file", path.display());
+        assert!(error.to_string().starts_with(&start));
+        assert!(matches!(open(&path.join("robot.toml")), RecordingError::NotCsv { .. }));
+        let error = open(&path.join("nowhere"));
+        assert!(matches!(error, RecordingError::NotFound { .. }));
+        assert!(error.to_string().contains("nowhere: no such file or directory"));
+        fs::create_dir(path.join("old.csv")).unwrap();
+        assert!(
+            matches!(open(path), RecordingError::NotRegular { path: p } if p == path.join("old.csv"))
+        );
+    }
+
+    #[test]
+    fn a_file_that_vanishes_or_grows_is_named() {
+        let dir = logs(&[("run.csv", "time_s,x,u\n0,0,0\n0.1,0,0\n")]);
+        let recording = Recording::open(dir.path()).unwrap();
+        fs::remove_file(&recording.files()[0]).unwrap();
+        let error = recording.read(&schema(), &mut Seen::default()).unwrap_err();
+        assert!(matches!(&error, ReadError::Unreadable { file, .. } if file.ends_with("run.csv")));
+        assert!(error.to_string().contains("run.csv: cannot be read: "));
+
+        /// Another program that adds a row while the log is read.
+        struct Writer(PathBuf);
+        impl Visitor for Writer {
+            fn begin(&mut self, _: &str) {
+                let mut text = fs::read_to_string(&self.0).unwrap();
+                text += "0.2,0,0\n";
+                fs::write(&self.0, text).unwrap();
+            }
+            fn row(&mut self, _: &[f64], _: &[f64]) {}
+        }
+        fs::write(&recording.files()[0], "time_s,x,u\n0,0,0\n0.1,0,0\n").unwrap();
+        let mut writer: Box<dyn Visitor> = Box::new(Writer(recording.files()[0].clone()));
+        let error = recording.read(&schema(), &mut *writer).unwrap_err();
+        assert!(matches!(error, ReadError::Changed { expected: 25, found: 33, .. }), "{error}");
     }
 }

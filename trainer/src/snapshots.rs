@@ -1,0 +1,82 @@
+//! Snapshot pairs: the observables at a sample, and what the operator has to make of them.
+
+use firmware_core::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS};
+use firmware_core::history::History;
+use firmware_core::model::Structure;
+
+use crate::recording::Visitor;
+
+/// Where a snapshot pair comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PairIndex {
+    /// Number of the trajectory, from 0.
+    pub trajectory: usize,
+    /// Row of the later sample in its trajectory, from 0.
+    pub row: u64,
+}
+
+/// Takes snapshot pairs.
+pub trait PairSink {
+    /// `values`, shape `[observables]`, as the dictionary takes them; `targets`, shape `[outputs]`.
+    fn pair(&mut self, at: PairIndex, values: &[f64], targets: &[f64]);
+    /// Bytes of the log read so far.
+    fn progress(&mut self, _bytes: u64) {}
+}
+
+/// Turns rows into snapshot pairs with the core's history; pairs never span two trajectories.
+#[derive(Debug)]
+pub struct Snapshots<'s, 'a, P> {
+    structure: &'s Structure<'a>,
+    history: History<f64>,
+    input: Vec<f64>,
+    at: PairIndex,
+    begun: bool,
+    sink: P,
+}
+
+impl<'s, 'a, P: PairSink> Snapshots<'s, 'a, P> {
+    /// Pairs for `structure` go to `sink`.
+    pub fn new(structure: &'s Structure<'a>, sink: P) -> Self {
+        Self {
+            structure,
+            history: History::default(),
+            input: vec![0.0; structure.inputs().len()],
+            at: PairIndex { trajectory: 0, row: 0 },
+            begun: false,
+            sink,
+        }
+    }
+
+    /// The sink.
+    pub fn into_sink(self) -> P {
+        self.sink
+    }
+}
+
+impl<P: PairSink> Visitor for Snapshots<'_, '_, P> {
+    fn begin(&mut self, _name: &str) {
+        self.history.clear();
+        self.at.trajectory += usize::from(self.begun);
+        self.at.row = 0;
+        self.begun = true;
+    }
+
+    fn row(&mut self, states: &[f64], inputs: &[f64]) {
+        let sample = self.structure.sample(states);
+        if self.history.len() > self.structure.lag() {
+            let mut values = [0.0; MAX_OBSERVABLES];
+            let mut targets = [0.0; MAX_OUTPUTS];
+            self.history.observe(self.structure, &self.input, &mut values);
+            self.history.targets(self.structure, &sample, &mut targets);
+            let observables = self.structure.dictionary().observables().len();
+            self.sink.pair(self.at, &values[..observables], &targets[..self.structure.outputs()]);
+        }
+        self.history.push(self.structure, &self.input, &sample);
+        self.input.copy_from_slice(inputs);
+        self.at.row += 1;
+    }
+
+    fn progress(&mut self, bytes: u64) {
+        self.sink.progress(bytes);
+    }
+}
