@@ -11,7 +11,7 @@
 //! | 8 | 4 | total length in bytes, divisible by 4 |
 //! | 12 | 4 | CRC-32 (ISO-HDLC: polynomial 0x04C11DB7 reflected) of bytes 0 to 11 and 16 to the end |
 //! | 16 | 12 n | section table |
-//! | 16 + 12 n | | the sections, in the order of the table, each padded with zeros to a multiple of 4 |
+//! | 16 + 12 n | | the sections, in the order of the table, each padded with zeros to a multiple of 4; no kind twice |
 //!
 //! | offset in an entry | size | field |
 //! |---|---|---|
@@ -34,13 +34,11 @@
 //! The self-test is one prediction: with L the largest lag, the states at samples k − L … k, shape
 //! `[L + 1, states]`; the inputs at the same samples, shape `[L + 1, inputs]`; the expected
 //! coordinates at k + 1 and the tolerance of each, shape `[states]` both. The model is refused
-//! unless it predicts within the tolerance (angles compared on the circle).
+//! unless it predicts within the tolerance, a finite one (angles compared on the circle).
 //!
 //! Metadata in postcard, field by field: integers of one byte as they are, lengths as varints,
 //! enumerations as a varint of the variant in the order of the declaration, `f32` as four bytes,
 //! text and lists with their length first.
-
-use core::cmp::Ordering;
 
 use crc::{CRC_32_ISO_HDLC, Crc};
 
@@ -158,7 +156,8 @@ pub enum EmitError {
         /// Its length.
         found: usize,
     },
-    /// The self-test has another shape than the model, or the model does not predict at all.
+    /// The self-test has another shape than the model, a tolerance is not a finite number from 0 on,
+    /// or the model does not predict at all.
     SelfTest,
 }
 
@@ -171,7 +170,7 @@ pub struct SelfTest<'a> {
     pub inputs: &'a [f32],
     /// Coordinates at k + 1, shape `[states]`.
     pub expected: &'a [f32],
-    /// Largest accepted difference of each, shape `[states]`.
+    /// Largest accepted difference of each, finite, shape `[states]`.
     pub tolerance: &'a [f32],
 }
 
@@ -225,7 +224,7 @@ impl<'a> SelfTest<'a> {
                 Space::Line => *p - *e,
                 Space::Circle => (*p - *e).wrap(),
             };
-            Scalar::abs(difference).partial_cmp(tolerance).is_none_or(Ordering::is_gt)
+            !(Scalar::abs(difference) <= *tolerance && tolerance.is_finite())
         })
     }
 }
@@ -420,7 +419,8 @@ pub fn emit(
     let (n, m) = (structure.states().len(), structure.inputs().len());
     let samples = structure.lag().saturating_add(1);
     let found = (states.len(), inputs.len(), tolerance.len());
-    if found != (samples.saturating_mul(n), samples.saturating_mul(m), n) {
+    let shape = (samples.saturating_mul(n), samples.saturating_mul(m), n);
+    if found != shape || !tolerance.iter().all(|t| t.is_finite() && *t >= 0.0) {
         return Err(EmitError::SelfTest);
     }
     let mut predicted = [0.0; MAX_STATES];

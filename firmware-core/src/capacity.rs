@@ -1,6 +1,7 @@
 //! What a controller built from this crate has room for.
 //!
-//! A blob is checked against these numbers once, when it is loaded; a larger model is refused with
+//! A blob is checked against these numbers once, when it is loaded, and a larger model is refused:
+//! one with longer lists than there is room for as undecodable metadata, a larger dictionary with
 //! the field, the capacity and what was found. They bound the size of [`Model`](crate::Model) and
 //! [`PredictorState`](crate::PredictorState), not of the coefficients, which stay in flash.
 

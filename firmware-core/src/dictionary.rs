@@ -10,7 +10,7 @@
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-use crate::Scalar;
+use crate::Number;
 use crate::capacity::{
     MAX_BASIS, MAX_BLOCK_FACTORS, MAX_BLOCKS, MAX_FACTORS, MAX_OBSERVABLES, MAX_ORDER, MAX_TERMS,
 };
@@ -279,7 +279,8 @@ impl Dictionary {
     /// `values` are the observables, shape `[observables]`; `terms` has shape `[dense_terms]`.
     /// Terms that are not [distinct](Self::is_distinct) are written too. Returns the number written;
     /// a `terms` that is too short is filled as far as whole blocks go.
-    pub fn lift_dense<S: Scalar>(&self, values: &[S], terms: &mut [S]) -> usize {
+    #[inline(always)]
+    pub fn lift_dense<S: Number>(&self, values: &[S], terms: &mut [S]) -> usize {
         let mut written = 0_usize;
         let mut rest = terms;
         for (_, own) in self.blocks() {
@@ -294,7 +295,8 @@ impl Dictionary {
 
     /// Writes the Kronecker product of the bases of `factors`, the first one slowest, into `terms`,
     /// shape `[product of the radices]`.
-    pub fn lift_factors<S: Scalar>(&self, factors: &[Factor], values: &[S], terms: &mut [S]) {
+    #[inline(always)]
+    pub fn lift_factors<S: Number>(&self, factors: &[Factor], values: &[S], terms: &mut [S]) {
         let mut basis = [S::ZERO; MAX_BASIS];
         if let Some(constant) = terms.first_mut() {
             *constant = S::ONE;
@@ -314,7 +316,7 @@ impl Dictionary {
 
     /// Writes the distinct terms Ψ in order and returns how many there are; `scratch` holds
     /// [`dense_terms`](Self::dense_terms) numbers. A `lifted` that is too short is filled.
-    pub fn lift<S: Scalar>(&self, values: &[S], scratch: &mut [S], lifted: &mut [S]) -> usize {
+    pub fn lift<S: Number>(&self, values: &[S], scratch: &mut [S], lifted: &mut [S]) -> usize {
         self.lift_dense(values, scratch);
         let distinct =
             scratch.iter().enumerate().filter(|(i, _)| self.is_distinct(*i)).map(|(_, term)| *term);
@@ -341,8 +343,8 @@ pub fn block_size(factors: &[Factor]) -> usize {
 /// firmware_core::dictionary::hermite(2.0, &mut h);
 /// assert_eq!(h, [1.0, 2.0, 3.0, 2.0, -5.0]); // 1, v, v² − 1, v³ − 3v, v⁴ − 6v² + 3
 /// ```
-#[inline]
-pub fn hermite<S: Scalar>(v: S, out: &mut [S]) {
+#[inline(always)]
+pub fn hermite<S: Number>(v: S, out: &mut [S]) {
     let (mut previous, mut current) = (S::ZERO, S::ONE);
     let mut n = S::ZERO;
     for h in out {
@@ -364,8 +366,8 @@ pub fn hermite<S: Scalar>(v: S, out: &mut [S]) {
 /// assert_eq!(f[..3], [1.0, 0.6, 0.8]);
 /// assert!((f[3] - 2.0 * s * c).abs() < 1e-15 && (f[4] - (c * c - s * s)).abs() < 1e-15);
 /// ```
-#[inline]
-pub fn fourier<S: Scalar>(sin: S, cos: S, out: &mut [S]) {
+#[inline(always)]
+pub fn fourier<S: Number>(sin: S, cos: S, out: &mut [S]) {
     let Some((constant, harmonics)) = out.split_first_mut() else { return };
     *constant = S::ONE;
     let (mut s, mut c) = (sin, cos);
@@ -378,8 +380,8 @@ pub fn fourier<S: Scalar>(sin: S, cos: S, out: &mut [S]) {
 }
 
 /// The basis functions of a factor at the values of the observables, in `out`.
-#[inline]
-pub(crate) fn basis_functions<'o, S: Scalar>(
+#[inline(always)]
+pub(crate) fn basis_functions<'o, S: Number>(
     factor: Factor,
     values: &[S],
     out: &'o mut [S; MAX_BASIS],
@@ -396,7 +398,7 @@ pub(crate) fn basis_functions<'o, S: Scalar>(
 
 /// The value of a factor's observable and of the one behind it.
 #[inline]
-pub(crate) fn observable_pair<S: Scalar>(factor: Factor, values: &[S]) -> (S, S) {
+pub(crate) fn observable_pair<S: Number>(factor: Factor, values: &[S]) -> (S, S) {
     let mut from = values.iter().skip(factor.observable.into()).copied();
     (from.next().unwrap_or_default(), from.next().unwrap_or_default())
 }

@@ -75,21 +75,23 @@ impl<S: Scalar> History<S> {
     /// it is ignored.
     #[inline]
     pub fn push(&mut self, structure: &Structure<'_>, input: &[S], next: &Sample<S>) {
-        let mut next = *next;
         let [newest, ..] = &mut self.samples;
         for (to, u) in newest.input.iter_mut().zip(input) {
             *to = *u;
         }
-        if structure.needs_increments() && self.filled > 0 {
-            next.increment = structure.increment(newest, &next);
-        }
+        let needed = structure.needs_increments() && self.filled > 0;
+        let increment = needed.then(|| structure.increment(newest, next));
         let kept = structure.lag().min(MAX_LAG);
         if kept > 0 {
             self.samples.copy_within(..kept, 1);
         }
         let [newest, ..] = &mut self.samples;
-        *newest = next;
-        self.filled = self.filled.saturating_add(1).min(MAX_LAG as u8 + 1);
+        *newest = *next;
+        if let Some(increment) = increment {
+            newest.increment = increment;
+        }
+        // No more than are kept: a state that goes to a model with more lags is not ready.
+        self.filled = self.filled.saturating_add(1).min(kept as u8 + 1);
     }
 
     /// The present coordinates in `out`, shape `[states]`: angles in (−π, π] where the model
@@ -136,7 +138,11 @@ impl<S: Scalar> History<S> {
     /// of the regression, shape `[outputs]`. The inverse of [`retract`](Self::retract).
     #[inline]
     pub fn targets(&self, structure: &Structure<'_>, next: &Sample<S>, out: &mut [S]) {
-        let increment = structure.increment(self.newest(), next);
+        let increments = structure.states().iter().any(|s| s.target == Target::Increment);
+        let increment = match increments {
+            true => structure.increment(self.newest(), next),
+            false => [S::ZERO; MAX_STATES],
+        };
         let mut to = out.iter_mut();
         for (i, state) in structure.states().iter().enumerate() {
             let mut put = |value| {

@@ -38,4 +38,4 @@ mod scalar;
 pub use blob::{parse, parse_for, parse_prefix};
 pub use model::{Model, ModelRepr, Structure};
 pub use predictor::{PredictError, Predictor, PredictorState};
-pub use scalar::Scalar;
+pub use scalar::{Lanes, Number, Scalar};

@@ -9,28 +9,65 @@ mod sealed {
     impl Sealed for f64 {}
 }
 
+/// What the lift needs of a number: addition, subtraction, multiplication.
+pub trait Number:
+    Copy + Default + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self>
+{
+    /// 0
+    const ZERO: Self;
+    /// 1
+    const ONE: Self;
+}
+
+/// Numbers side by side, for lifting `N` samples at once; every lane is rounded as on its own.
+///
+/// ```
+/// use firmware_core::Lanes;
+/// assert_eq!((Lanes([1.0, 2.0]) * Lanes([3.0, 4.0]) + Lanes([0.5, 0.5])).0, [3.5, 8.5]);
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[repr(transparent)]
+pub struct Lanes<S, const N: usize>(pub [S; N]);
+
+impl<S: Number, const N: usize> Default for Lanes<S, N> {
+    #[inline(always)]
+    fn default() -> Self {
+        Self([S::ZERO; N])
+    }
+}
+
+macro_rules! lanes {
+    ($operator:ident, $function:ident) => {
+        impl<S: Number, const N: usize> $operator for Lanes<S, N> {
+            type Output = Self;
+            #[inline(always)]
+            fn $function(mut self, other: Self) -> Self {
+                for (a, b) in self.0.iter_mut().zip(other.0) {
+                    *a = a.$function(b);
+                }
+                self
+            }
+        }
+    };
+}
+
+lanes!(Add, add);
+lanes!(Sub, sub);
+lanes!(Mul, mul);
+
+impl<S: Number, const N: usize> Number for Lanes<S, N> {
+    const ZERO: Self = Self([S::ZERO; N]);
+    const ONE: Self = Self([S::ONE; N]);
+}
+
 /// `f32` on the controller, `f64` in the trainer.
 ///
 /// The elementary functions call `libm` by name. std's and num-traits' versions differ from it in
 /// the last bit of about one value in seventy, and which of them a generic `sin` means changes with
 /// the crates that happen to be in the build; laptop and controller would then disagree.
 pub trait Scalar:
-    sealed::Sealed
-    + Copy
-    + Debug
-    + Default
-    + PartialOrd
-    + Add<Output = Self>
-    + Sub<Output = Self>
-    + Mul<Output = Self>
-    + Div<Output = Self>
-    + Neg<Output = Self>
-    + 'static
+    sealed::Sealed + Number + Debug + PartialOrd + Div<Output = Self> + Neg<Output = Self> + 'static
 {
-    /// 0
-    const ZERO: Self;
-    /// 1
-    const ONE: Self;
     /// π
     const PI: Self;
     /// 2π
@@ -84,9 +121,12 @@ pub trait Scalar:
 
 macro_rules! scalar {
     ($float:ident, $sincos:ident, $atan2:ident, $sqrt:ident, $ceil:ident, $fmod:ident, $fabs:ident) => {
-        impl Scalar for $float {
+        impl Number for $float {
             const ZERO: Self = 0.0;
             const ONE: Self = 1.0;
+        }
+
+        impl Scalar for $float {
             const PI: Self = core::$float::consts::PI;
             const TAU: Self = core::$float::consts::TAU;
 

@@ -3,11 +3,11 @@
 mod fixtures;
 mod naive;
 
-use firmware_core::Scalar;
 use firmware_core::capacity::{MAX_BLOCK_FACTORS, MAX_ORDER, MAX_TERMS};
 use firmware_core::dictionary::{
     self, Basis, Block, Dictionary, DictionaryError, Factor, Observable, Source,
 };
+use firmware_core::{Lanes, Scalar};
 use fixtures::{Part, at, fourier, hermite};
 use proptest::prelude::*;
 
@@ -285,6 +285,22 @@ proptest! {
         let union: Vec<_> =
             expected.iter().zip(&distinct).filter(|(_, there)| **there).map(|(t, _)| *t).collect();
         assert_close(&lift(&d, &values), &union);
+    }
+
+    /// Samples lifted side by side are rounded as on their own, to the bit.
+    #[test]
+    fn lanes_do_not_touch_each_other(
+        parts in fixtures::parts(), samples in prop::array::uniform4(fixtures::values()),
+    ) {
+        let d = of(&parts);
+        let lanes: Vec<_> =
+            (0..samples[0].len()).map(|o| Lanes(samples.each_ref().map(|v| v[o]))).collect();
+        let mut together = vec![Lanes([f64::NAN; 4]); d.dense_terms()];
+        prop_assert_eq!(d.lift_dense(&lanes, &mut together), d.dense_terms());
+        for (i, sample) in samples.iter().enumerate() {
+            let lane: Vec<f64> = together.iter().map(|term| term.0[i]).collect();
+            prop_assert_eq!(lane, lift_dense(&d, sample));
+        }
     }
 
     /// The first block always keeps all it holds; a block repeated adds nothing.

@@ -438,6 +438,22 @@ fn not_ready_until_the_history_is_full() {
     }
 }
 
+/// A state that moves on to a model with more lags has to be filled again.
+#[test]
+fn a_history_is_as_long_as_its_model_looks_back() {
+    let states = [state("x", Space::Line, Target::Absolute)];
+    let short = linear(&states, 0, Symmetry::None, &[(Source::State(0), 1)]);
+    let long = linear(&states, 0, Symmetry::None, &[(Source::State(0), 3)]);
+    let (short, long) = (model(&short, &[0.0, 1.0]), model(&long, &[0.0, 1.0]));
+    let mut state: PredictorState = PredictorState::new();
+    for have in 0..5 {
+        assert_eq!(state.history().len(), have.min(2));
+        Predictor::new(&short).observe(&mut state, &[], &[1.0]).unwrap();
+    }
+    let not_ready = Err(PredictError::NotReady { have: 2, need: 4 });
+    assert_eq!(Predictor::new(&long).step(&mut state, &[]), not_ready);
+}
+
 #[test]
 fn a_measurement_starts_a_new_prediction() {
     let repr = fixtures::one_state();
@@ -625,6 +641,7 @@ fn a_hard_limit_ends_a_rollout() {
 #[test]
 fn numbers_that_are_none() {
     for target in [Target::Absolute, Target::Increment] {
+        let states = [State { limit: UNBOUNDED, ..state("x", Space::Line, target) }];
         let repr = one_coordinate(Space::Line, target, UNBOUNDED);
         let squared = model(&repr, &[0.0_f32, 0.0, 1.0]);
         let predictor = Predictor::new(&squared);
@@ -633,7 +650,6 @@ fn numbers_that_are_none() {
         predictor.step(&mut state, &[0.0]).unwrap(); // 1e30
         assert_diverges(&predictor, &mut state, &[0.0], 2); // ∞
 
-        let states = [State { limit: UNBOUNDED, ..state("x", Space::Line, target) }];
         let sources = [(Source::State(0), 0), (Source::Input(0), 0)];
         let difference = [0.0, f32::MAX, 0.0, -f32::MAX];
         let difference = model(&linear(&states, 1, Symmetry::None, &sources), &difference);

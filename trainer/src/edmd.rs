@@ -334,7 +334,7 @@ pub struct Fit<'r> {
     pub ranges: Vec<f32>,
     /// A snapshot from the data: coordinates at the lags and the present sample, oldest first, and
     /// the inputs at the same samples.
-    pub example: (Vec<f32>, Vec<f32>),
+    pub example: (Vec<f64>, Vec<f64>),
     /// Standard deviation of every coordinate (wrapped on S¹).
     pub spread: Vec<f64>,
     /// What was read.
@@ -463,8 +463,8 @@ const EXAMPLE_ROW: usize = 20;
 /// The latest of the first rows of the first trajectory that is long enough.
 struct Example {
     window: usize,
-    states: Vec<Vec<f32>>,
-    inputs: Vec<Vec<f32>>,
+    states: Vec<Vec<f64>>,
+    inputs: Vec<Vec<f64>>,
     rows: usize,
     done: bool,
 }
@@ -490,14 +490,13 @@ impl Example {
             self.states.remove(0);
             self.inputs.remove(0);
         }
-        let narrow = |row: &[f64]| row.iter().map(|x| *x as f32).collect();
-        self.states.push(narrow(states));
-        self.inputs.push(narrow(inputs));
+        self.states.push(states.to_vec());
+        self.inputs.push(inputs.to_vec());
         self.rows += 1;
         self.done = self.rows == self.window + EXAMPLE_ROW;
     }
 
-    fn take(self) -> (Vec<f32>, Vec<f32>) {
+    fn take(self) -> (Vec<f64>, Vec<f64>) {
         (self.states.concat(), self.inputs.concat())
     }
 }

@@ -11,13 +11,20 @@
 
 use firmware_core::capacity::MAX_BASIS;
 use firmware_core::dictionary::{Basis, Dictionary, Factor, fourier};
+use firmware_core::{Lanes, Number};
+use pulp::{Simd, WithSimd};
 
 use crate::terms::distinct_terms;
 
-/// Pairs that are lifted and summed at once: all buffers of a chunk stay in the L1 cache.
-const CHUNK: usize = 64;
-/// Rows and columns of a register tile.
-const TILE: (usize, usize) = (4, 8);
+/// Samples side by side.
+const LANES: usize = 8;
+/// Groups of samples that are lifted and summed at once: the buffers of a chunk stay in the cache.
+const CHUNK: usize = 32;
+/// Columns of the left and right matrix in a register tile.
+const TILE: (usize, usize) = (2, 4);
+
+/// One number of [`LANES`] samples.
+type Lane = Lanes<f64, LANES>;
 
 /// G and A of a number of pairs.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,16 +52,16 @@ pub struct GramAccumulator {
     filled: usize,
     observables: usize,
     /// Shape `[CHUNK, observables]`.
-    values: Vec<f64>,
-    /// Shape `[CHUNK, padded outputs]`.
-    targets: Vec<f64>,
-    /// Shape `[CHUNK, padded terms]`.
-    lifted: Vec<f64>,
-    dense: Vec<f64>,
+    values: Vec<Lane>,
+    /// Shape `[CHUNK, outputs]`.
+    targets: Vec<Lane>,
+    /// Shape `[CHUNK, terms]`.
+    lifted: Vec<Lane>,
+    dense: Vec<Lane>,
     moments: Option<Moments>,
-    /// Shape `[padded terms, padded terms]`, upper tiles; without moments.
+    /// Shape `[terms, terms]`, upper tiles; without moments.
     gram: Vec<f64>,
-    /// Shape `[padded outputs, padded terms]`.
+    /// Shape `[outputs, terms]`.
     cross: Vec<f64>,
 }
 
@@ -63,11 +70,11 @@ pub struct GramAccumulator {
 struct Moments {
     factors: Vec<Factor>,
     split: usize,
-    /// Shape `[CHUNK, padded slow moments]`.
-    slow: Vec<f64>,
-    /// Shape `[CHUNK, padded fast moments]`.
-    fast: Vec<f64>,
-    /// Shape `[padded slow, padded fast]`.
+    /// Shape `[CHUNK, slow moments]`.
+    slow: Vec<Lane>,
+    /// Shape `[CHUNK, fast moments]`.
+    fast: Vec<Lane>,
+    /// Shape `[slow, fast]`.
     sums: Vec<f64>,
 }
 
@@ -80,61 +87,53 @@ fn size(factors: &[Factor]) -> usize {
     factors.iter().map(|f| products(*f)).product()
 }
 
-fn padded(len: usize, tile: usize) -> usize {
-    len.next_multiple_of(tile)
-}
-
 impl Moments {
-    /// `None` where summing the moments costs more than summing G itself.
+    /// `None` where summing the moments costs more than summing the upper half of G itself.
     fn new(dictionary: &Dictionary, terms: usize) -> Option<Self> {
         let mut blocks = dictionary.blocks();
         let (_, factors) = blocks.next()?;
-        if blocks.next().is_some() {
+        if blocks.next().is_some() || 2 * size(factors) > terms * terms {
             return None;
         }
-        let cost = |split: usize| {
-            let (slow, fast) = factors.split_at(split);
-            padded(size(slow), TILE.0) * padded(size(fast), TILE.1)
-        };
-        let split = (0..=factors.len()).min_by_key(|split| cost(*split))?;
-        if 2 * cost(split) > terms * terms {
-            return None;
-        }
-        let (slow, fast) = factors.split_at(split);
-        let (p, q) = (padded(size(slow), TILE.0), padded(size(fast), TILE.1));
+        // The nearer the halves, the fewer numbers are made per sample.
+        let made = |split: &usize| size(&factors[..*split]) + size(&factors[*split..]);
+        let split = (0..=factors.len()).min_by_key(made)?;
+        let (p, q) = (size(&factors[..split]), size(&factors[split..]));
         Some(Self {
             factors: factors.to_vec(),
             split,
-            slow: vec![0.0; CHUNK * p],
-            fast: vec![0.0; CHUNK * q],
+            slow: vec![Lane::ZERO; CHUNK * p],
+            fast: vec![Lane::ZERO; CHUNK * q],
             sums: vec![0.0; p * q],
         })
     }
 
     #[inline(always)]
-    fn add(&mut self, values: &[f64], observables: usize, rows: usize) {
+    fn add<S: Simd>(
+        &mut self,
+        simd: S,
+        values: &[Lane],
+        observables: usize,
+        groups: usize,
+        empty: usize,
+    ) {
         let (slow, fast) = self.factors.split_at(self.split);
-        let (p, q) = (padded(size(slow), TILE.0), padded(size(fast), TILE.1));
-        let samples = values.chunks_exact(observables).take(rows);
+        let (p, q) = (size(slow), size(fast));
+        let samples = values.chunks_exact(observables).take(groups);
         let buffers = self.slow.chunks_exact_mut(p).zip(self.fast.chunks_exact_mut(q));
         for (values, (s, f)) in samples.zip(buffers) {
             moments(slow, values, s);
             moments(fast, values, f);
         }
-        add_product(rows, (&self.slow, p), (&self.fast, q), &mut self.sums, false);
+        if let Some(last) = groups.checked_sub(1) {
+            blank(&mut self.slow[last * p..][..p], empty);
+        }
+        add_product(simd, groups, (&self.slow, p), (&self.fast, q), &mut self.sums, false);
     }
 
     /// Spreads the sums over `[dense terms, dense terms]`.
     fn gram(&self) -> Vec<f64> {
-        let (slow, fast) = self.factors.split_at(self.split);
-        let (fast_len, fast_padded) = (size(fast), padded(size(fast), TILE.1));
-        let mut tensor: Vec<f64> = self
-            .sums
-            .chunks_exact(fast_padded)
-            .take(size(slow))
-            .flat_map(|row| &row[..fast_len])
-            .copied()
-            .collect();
+        let mut tensor = self.sums.clone();
         // One axis after the other, from moments to pairs of basis functions.
         let mut after: usize = tensor.len();
         for factor in &self.factors {
@@ -175,22 +174,29 @@ impl Moments {
     }
 }
 
+/// Sets the last `empty` lanes to 0.
+fn blank(row: &mut [Lane], empty: usize) {
+    for lanes in row {
+        lanes.0[LANES - empty..].fill(0.0);
+    }
+}
+
 /// The kron over factors of the functions that products of two basis functions are made of: powers
 /// up to 2p, harmonics up to 2p.
 #[inline(always)]
-fn moments(factors: &[Factor], values: &[f64], out: &mut [f64]) {
-    let mut functions = [0.0; 2 * MAX_BASIS];
-    out[0] = 1.0;
+fn moments(factors: &[Factor], values: &[Lane], out: &mut [Lane]) {
+    let mut functions = [Lane::ZERO; 2 * MAX_BASIS];
+    out[0] = Lane::ONE;
     let mut len = 1;
     for factor in factors.iter().rev() {
         let v = values[usize::from(factor.observable)];
         let count = products(*factor);
         match factor.basis {
             Basis::Hermite => {
-                let mut power = 1.0;
+                let mut power = Lane::ONE;
                 for f in &mut functions[..count] {
                     *f = power;
-                    power *= v;
+                    power = power * v;
                 }
             }
             Basis::Fourier => {
@@ -201,7 +207,7 @@ fn moments(factors: &[Factor], values: &[f64], out: &mut [f64]) {
         let (inner, outer) = out.split_at_mut(len);
         for (chunk, f) in outer.chunks_exact_mut(len).zip(&functions[1..count]) {
             for (to, x) in chunk.iter_mut().zip(&*inner) {
-                *to = f * x;
+                *to = *f * *x;
             }
         }
         len *= count;
@@ -281,40 +287,73 @@ pub fn hermite_powers(n: usize) -> Vec<f64> {
     current
 }
 
-/// `out += leftᵀ right` over `rows` rows; `left` and `right` come with their padded row lengths.
-/// With `upper`, tiles wholly below the diagonal are left alone.
+/// `out += leftᵀ right`, summed over `groups` groups of samples; `left` and `right` come with their
+/// numbers per sample p and q, `out` has shape `[p, q]`. With `upper`, tiles wholly below the
+/// diagonal are left alone.
 #[inline(always)]
-fn add_product(
-    rows: usize,
-    left: (&[f64], usize),
-    right: (&[f64], usize),
+fn add_product<S: Simd>(
+    simd: S,
+    groups: usize,
+    (left, p): (&[Lane], usize),
+    (right, q): (&[Lane], usize),
     out: &mut [f64],
     upper: bool,
 ) {
-    let ((left, p), (right, q)) = (left, right);
-    let (left, right) = (&left[..rows * p], &right[..rows * q]);
+    let (left, right) = (&left[..groups * p], &right[..groups * q]);
     for i in (0..p).step_by(TILE.0) {
         for j in (0..q).step_by(TILE.1) {
             if upper && j + TILE.1 <= i {
                 continue;
             }
-            let mut sums = [[0.0; TILE.1]; TILE.0];
-            for (l, r) in left.chunks_exact(p).zip(right.chunks_exact(q)) {
-                let l: &[f64; TILE.0] = l[i..].first_chunk().unwrap_or(&[0.0; TILE.0]);
-                let r: &[f64; TILE.1] = r[j..].first_chunk().unwrap_or(&[0.0; TILE.1]);
-                for (sums, l) in sums.iter_mut().zip(l) {
-                    for (sum, r) in sums.iter_mut().zip(r) {
-                        *sum += l * r;
+            let mut sums = [[Lane::ZERO; TILE.1]; TILE.0];
+            // As many lanes as the machine has side by side; each lane is summed on its own.
+            for part in 0..LANES / S::F64_LANES {
+                let mut tile = [[simd.splat_f64s(0.0); TILE.1]; TILE.0];
+                for (l, r) in left.chunks_exact(p).zip(right.chunks_exact(q)) {
+                    let (mut a, mut b) = ([tile[0][0]; TILE.0], [tile[0][0]; TILE.1]);
+                    // Beyond the edge the last column is multiplied again and not used.
+                    for (k, a) in a.iter_mut().enumerate() {
+                        *a = S::as_simd_f64s(&l[(i + k).min(p - 1)].0).0[part];
+                    }
+                    for (k, b) in b.iter_mut().enumerate() {
+                        *b = S::as_simd_f64s(&r[(j + k).min(q - 1)].0).0[part];
+                    }
+                    for (tile, a) in tile.iter_mut().zip(a) {
+                        for (sum, b) in tile.iter_mut().zip(b) {
+                            *sum = simd.add_f64s(*sum, simd.mul_f64s(a, b));
+                        }
+                    }
+                }
+                for (sums, tile) in sums.iter_mut().zip(tile) {
+                    for (sum, part_sum) in sums.iter_mut().zip(tile) {
+                        S::as_mut_simd_f64s(&mut sum.0).0[part] = part_sum;
                     }
                 }
             }
-            for (k, sums) in sums.iter().enumerate() {
-                let row = &mut out[(i + k) * q + j..][..TILE.1];
-                for (to, sum) in row.iter_mut().zip(sums) {
-                    *to += sum;
+            for (out, sums) in out[i * q..].chunks_exact_mut(q).zip(sums) {
+                for (to, sum) in out[j..].iter_mut().zip(sums) {
+                    *to += total(sum);
                 }
             }
         }
+    }
+}
+
+/// The sum over the lanes, by halves.
+#[inline(always)]
+fn total(Lanes([a, b, c, d, e, f, g, h]): Lane) -> f64 {
+    ((a + e) + (c + g)) + ((b + f) + (d + h))
+}
+
+/// The work on a chunk, compiled once for every vector unit.
+struct AddChunk<'g>(&'g mut GramAccumulator);
+
+impl WithSimd for AddChunk<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        self.0.add_chunk(simd);
     }
 }
 
@@ -322,8 +361,8 @@ impl GramAccumulator {
     /// Sums for `outputs` targets over the distinct terms of `dictionary`.
     pub fn new(dictionary: &Dictionary, outputs: usize) -> Self {
         let distinct = distinct_terms(dictionary);
-        let (n, m) = (padded(distinct.len(), TILE.1), padded(outputs, TILE.0));
-        let moments = Moments::new(dictionary, distinct.len());
+        let (n, m, observables) = (distinct.len(), outputs, dictionary.observables().len());
+        let moments = Moments::new(dictionary, n);
         let gram = if moments.is_some() { 0 } else { n * n };
         Self {
             dictionary: dictionary.clone(),
@@ -331,11 +370,11 @@ impl GramAccumulator {
             outputs,
             pairs: 0,
             filled: 0,
-            observables: dictionary.observables().len(),
-            values: vec![0.0; CHUNK * dictionary.observables().len()],
-            targets: vec![0.0; CHUNK * m],
-            lifted: vec![0.0; CHUNK * n],
-            dense: vec![0.0; dictionary.dense_terms()],
+            observables,
+            values: vec![Lane::ZERO; CHUNK * observables],
+            targets: vec![Lane::ZERO; CHUNK * m],
+            lifted: vec![Lane::ZERO; CHUNK * n],
+            dense: vec![Lane::ZERO; dictionary.dense_terms()],
             moments,
             gram: vec![0.0; gram],
             cross: vec![0.0; m * n],
@@ -346,39 +385,34 @@ impl GramAccumulator {
     /// Adds a snapshot pair: values of the observables and targets.
     #[inline]
     pub fn push(&mut self, values: &[f64], targets: &[f64]) {
-        let (k, o) = (self.filled, self.observables);
-        let m = padded(self.outputs, TILE.0);
-        self.values[k * o..][..o].copy_from_slice(values);
-        self.targets[k * m..][..self.outputs].copy_from_slice(targets);
+        let (group, lane) = (self.filled / LANES, self.filled % LANES);
+        let group_values = &mut self.values[group * self.observables..][..self.observables];
+        for (to, v) in group_values.iter_mut().zip(values) {
+            to.0[lane] = *v;
+        }
+        let group_targets = &mut self.targets[group * self.outputs..][..self.outputs];
+        for (to, z) in group_targets.iter_mut().zip(targets) {
+            to.0[lane] = *z;
+        }
         self.filled += 1;
         self.pairs += 1;
-        if self.filled == CHUNK {
+        if self.filled == CHUNK * LANES {
             self.flush();
         }
     }
 
     fn flush(&mut self) {
-        let arch = self.arch;
-        arch.dispatch(
-            #[inline(always)]
-            || self.add_chunk(),
-        );
+        self.arch.dispatch(AddChunk(self));
         self.filled = 0;
     }
 
     #[inline(always)]
-    fn add_chunk(&mut self) {
-        let rows = self.filled;
-        let (n, m) = (padded(self.distinct.len(), TILE.1), padded(self.outputs, TILE.0));
-        let samples = self.values.chunks_exact(self.observables.max(1)).take(rows);
-        let all_distinct = self.distinct.len() == self.dictionary.dense_terms();
-        if self.observables == 0 {
-            for row in self.lifted.chunks_exact_mut(n) {
-                row[0] = 1.0;
-            }
-        }
-        for (values, row) in samples.zip(self.lifted.chunks_exact_mut(n)) {
-            if all_distinct {
+    fn add_chunk<S: Simd>(&mut self, simd: S) {
+        let (n, m, o) = (self.distinct.len(), self.outputs, self.observables);
+        let groups = self.filled.div_ceil(LANES);
+        for (k, row) in self.lifted.chunks_exact_mut(n).enumerate().take(groups) {
+            let values = &self.values[k * o..][..o];
+            if n == self.dense.len() {
                 self.dictionary.lift_dense(values, row);
             } else {
                 self.dictionary.lift_dense(values, &mut self.dense);
@@ -387,10 +421,22 @@ impl GramAccumulator {
                 }
             }
         }
-        add_product(rows, (&self.targets, m), (&self.lifted, n), &mut self.cross, false);
+        // The lanes behind the last sample hold an older one: they must not count.
+        let empty = groups * LANES - self.filled;
+        if let Some(last) = groups.checked_sub(1) {
+            blank(&mut self.lifted[last * n..][..n], empty);
+        }
+        add_product(simd, groups, (&self.targets, m), (&self.lifted, n), &mut self.cross, false);
         match &mut self.moments {
-            Some(moments) => moments.add(&self.values, self.observables, rows),
-            None => add_product(rows, (&self.lifted, n), (&self.lifted, n), &mut self.gram, true),
+            Some(moments) => moments.add(simd, &self.values, o, groups, empty),
+            None => add_product(
+                simd,
+                groups,
+                (&self.lifted, n),
+                (&self.lifted, n),
+                &mut self.gram,
+                true,
+            ),
         }
     }
 
@@ -400,7 +446,6 @@ impl GramAccumulator {
             self.flush();
         }
         let (n, m) = (self.distinct.len(), self.outputs);
-        let padded = padded(n, TILE.1);
         let mut gram = vec![0.0; n * n];
         match &self.moments {
             Some(moments) => {
@@ -415,7 +460,7 @@ impl GramAccumulator {
             None => {
                 for i in 0..n {
                     for j in 0..n {
-                        gram[i * n + j] = self.gram[i.min(j) * padded + i.max(j)];
+                        gram[i * n + j] = self.gram[i.min(j) * n + i.max(j)];
                     }
                 }
             }
@@ -423,7 +468,7 @@ impl GramAccumulator {
         let mut cross = vec![0.0; n * m];
         for (i, row) in cross.chunks_exact_mut(m).enumerate() {
             for (j, to) in row.iter_mut().enumerate() {
-                *to = self.cross[j * padded + i];
+                *to = self.cross[j * n + i];
             }
         }
         NormalEquations { terms: n, outputs: m, pairs: self.pairs, gram, cross }

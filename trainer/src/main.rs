@@ -1,2 +1,698 @@
-//! trainer
-fn main() {}
+//! The command `trainer`: logs in, a model for the controller out.
+
+use std::fmt::Display;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+use firmware_core::blob;
+use firmware_core::model::{Model, Space, Structure};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
+use trainer::edmd;
+use trainer::export::{export, write_whole};
+use trainer::inspect::{blocks, inspect};
+use trainer::recording::{LogColumn, LogSchema, Recording};
+use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
+use trainer::resample::{InputResampling, ResamplePlan, resample};
+use trainer::robot::{Method, Robot, ScoreOptions};
+use trainer::score::{self, Counts, Lifted};
+use trainer::topology::{Orders, lifting};
+use trainer::trajectory::Logs;
+
+/// Fits Koopman models to robot logs and writes them as blobs that a microcontroller reads.
+#[derive(Parser)]
+#[command(version, max_term_width = 100)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Fit(FitArgs),
+    Evaluate(EvaluateArgs),
+    Inspect(InspectArgs),
+    Dictionary(DictionaryArgs),
+    Resample(ResampleArgs),
+}
+
+/// Fit the model of a robot to its logs, score it on held-out trajectories, and write the blob.
+#[derive(Args)]
+struct FitArgs {
+    /// The robot's folder, or its robot.toml.
+    robot: PathBuf,
+    /// Folder of CSV logs, or one CSV file [default: logs/ beside robot.toml].
+    #[arg(long, value_name = "DIR")]
+    logs: Option<PathBuf>,
+    /// Where the blob is written [default: model.bin beside robot.toml].
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Do not score: only read, fit and write.
+    #[arg(long)]
+    no_score: bool,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Score a blob on logs, with the controller's own f32 predictor.
+#[derive(Args)]
+struct EvaluateArgs {
+    /// The blob.
+    model: PathBuf,
+    /// Folder of CSV logs to score on, or one CSV file.
+    #[arg(long, value_name = "DIR")]
+    logs: PathBuf,
+    /// Logs that the linear ARX is fitted on [default: cross-validation over --logs].
+    #[arg(long, value_name = "DIR")]
+    train: Option<PathBuf>,
+    /// The robot.toml that names the columns [default: the one beside the blob, if it is there;
+    /// otherwise columns are found by the names and units in the blob].
+    #[arg(long, value_name = "FILE")]
+    robot: Option<PathBuf>,
+    /// Steps of a rollout [default: as in robot.toml, or 50].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    horizon: Option<u32>,
+    /// Samples between the starts of two windows [default: as in robot.toml, or 10].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    stride: Option<u32>,
+    /// Write every step of every window, measured and predicted, to this file.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Show everything in a blob in readable form.
+#[derive(Args)]
+struct InspectArgs {
+    /// The blob.
+    model: PathBuf,
+    /// Show every term of the equations, not only the largest.
+    #[arg(long)]
+    all: bool,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Show the lifting functions of a topology, as in the ACD-EDMD paper's table.
+#[derive(Args)]
+struct DictionaryArgs {
+    /// A product of R^n (or E^n), S^1, T^n and S^2, such as "R^2 x S^1".
+    topology: String,
+    /// Number of inputs.
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=12))]
+    inputs: u8,
+    /// Highest Hermite order: a number for all variables, or NAME=N for one; 0 leaves it out. May
+    /// be repeated or separated by commas.
+    #[arg(long, value_name = "N|NAME=N", value_delimiter = ',')]
+    order: Vec<String>,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Put logs on an even time grid: states are interpolated, inputs are held.
+#[derive(Args)]
+struct ResampleArgs {
+    /// Folder of CSV logs, or one CSV file.
+    logs: PathBuf,
+    /// Step of the new grid in seconds.
+    #[arg(long, value_name = "SECONDS")]
+    dt: f64,
+    /// Folder for the new logs.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// The robot.toml that says which columns are states, inputs and angles.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["time", "episode", "inputs", "angles", "degrees"])]
+    robot: Option<PathBuf>,
+    /// Without a robot.toml: the time column.
+    #[arg(long, value_name = "COLUMN", default_value = "time_s")]
+    time: String,
+    /// Without a robot.toml: the episode column.
+    #[arg(long, value_name = "COLUMN")]
+    episode: Option<String>,
+    /// Without a robot.toml: columns that are inputs; all others are states.
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
+    inputs: Vec<String>,
+    /// Without a robot.toml: states that are angles in radians, interpolated the short way round.
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
+    angles: Vec<String>,
+    /// Without a robot.toml: states that are angles in degrees.
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
+    degrees: Vec<String>,
+    /// Average each input over the new interval instead of taking the value held at its start.
+    #[arg(long)]
+    mean_inputs: bool,
+    /// Longest gap that is interpolated, in seconds [default: ten steps of the new grid]; a longer
+    /// one starts a new file.
+    #[arg(long, value_name = "SECONDS")]
+    max_gap: Option<f64>,
+}
+
+/// A message for the user.
+struct Failure(String);
+
+impl<E: Display> From<E> for Failure {
+    fn from(error: E) -> Self {
+        Self(error.to_string())
+    }
+}
+
+fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Fit(args) => fit(&args),
+        Command::Evaluate(args) => evaluate(&args),
+        Command::Inspect(args) => show_blob(&args),
+        Command::Dictionary(args) => dictionary(&args),
+        Command::Resample(args) => resample_logs(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure(message)) => {
+            eprintln!("error: {message}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Prints to standard output; a reader that went away is not an error.
+fn print(text: &str) -> Result<(), Failure> {
+    match std::io::stdout().lock().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
+        _ => Ok(()),
+    }
+}
+
+fn print_json(value: &impl Serialize) -> Result<(), Failure> {
+    print(&(serde_json::to_string_pretty(value)? + "\n"))
+}
+
+/// A bar on standard error, where that is a terminal.
+fn bar(what: &'static str, bytes: u64) -> ProgressBar {
+    let bar = ProgressBar::new(bytes);
+    if let Ok(style) =
+        ProgressStyle::with_template("{msg:9} {wide_bar} {bytes}/{total_bytes} {eta}")
+    {
+        bar.set_style(style);
+    }
+    bar.set_message(what);
+    bar
+}
+
+/// `fit --json`.
+#[derive(Serialize)]
+struct FitReport<'r> {
+    format: u32,
+    command: &'static str,
+    robot: &'r str,
+    model: ModelReport,
+    fit: OperatorReport,
+    score: Option<ScoreReport>,
+    /// Why there is no score.
+    unscored: Option<String>,
+}
+
+#[derive(Serialize)]
+struct ModelReport {
+    file: String,
+    bytes: usize,
+    terms: usize,
+    outputs: usize,
+    coefficients: usize,
+    zeros: usize,
+    lag: usize,
+    blocks: Vec<String>,
+    logs_sha256: String,
+    robot_sha256: String,
+}
+
+#[derive(Serialize)]
+struct OperatorReport {
+    method: &'static str,
+    scale_columns: bool,
+    ridge: f64,
+    truncation: f64,
+    trajectories: usize,
+    rows: u64,
+    pairs: u64,
+    rank: usize,
+    condition: f64,
+}
+
+fn fit(args: &FitArgs) -> Result<(), Failure> {
+    let robot = Robot::load(&args.robot)?;
+    let folder = if args.robot.is_dir() {
+        args.robot.clone()
+    } else {
+        args.robot.parent().map(Path::to_owned).unwrap_or_default()
+    };
+    let logs = args.logs.clone().unwrap_or_else(|| folder.join("logs"));
+    let out = args.out.clone().unwrap_or_else(|| folder.join("model.bin"));
+    let recording = Recording::open(&logs)?;
+    let source = Logs { recording: &recording, schema: &robot.schema };
+
+    let reading = bar("fitting", recording.bytes());
+    let fitted = edmd::fit(&robot, &source, &|bytes| reading.set_position(bytes));
+    reading.finish_and_clear();
+    let fitted = fitted?;
+    let bytes = export(&fitted)?;
+
+    let (mut report, mut unscored) = (None, None);
+    if !args.no_score {
+        let counts =
+            Counts { trajectories: fitted.summary.trajectories, rows: fitted.summary.rows };
+        let scoring = bar("scoring", recording.bytes());
+        let lifted = Lifted::Fitted(&fitted.structure, &robot.fit);
+        let scored =
+            score::score(&source, counts, lifted, &robot.score, None, &|b| scoring.set_position(b));
+        scoring.finish_and_clear();
+        match scored {
+            Ok(score) => report = Some(ScoreReport::new(&score, &labels(&fitted.structure))),
+            Err(
+                error @ (score::ScoreError::NoWindow { .. } | score::ScoreError::Untrained { .. }),
+            ) => {
+                unscored = Some(error.to_string());
+            }
+            Err(error) => return Err(error.into()),
+        }
+    }
+    write_whole(&out, |file| file.write_all(&bytes))?;
+
+    let coefficients =
+        trainer::export::controller_coefficients(fitted.structure.dictionary(), &fitted.operator);
+    let options = robot.fit;
+    let provenance = fitted.structure.provenance();
+    let report = FitReport {
+        format: 1,
+        command: "fit",
+        robot: &robot.name,
+        model: ModelReport {
+            file: out.display().to_string(),
+            bytes: bytes.len(),
+            terms: fitted.operator.terms,
+            outputs: fitted.operator.outputs,
+            coefficients: coefficients.len(),
+            zeros: coefficients.iter().filter(|c| **c == 0.0).count(),
+            lag: fitted.structure.lag(),
+            blocks: blocks(&fitted.structure),
+            logs_sha256: hexadecimal(&provenance.logs),
+            robot_sha256: hexadecimal(&provenance.robot),
+        },
+        fit: OperatorReport {
+            method: match options.method {
+                Method::Cholesky => "cholesky",
+                Method::Qr => "qr",
+                Method::Svd => "svd",
+            },
+            scale_columns: options.scale_columns,
+            ridge: options.ridge,
+            truncation: options.truncation,
+            trajectories: fitted.summary.trajectories,
+            rows: fitted.summary.rows,
+            pairs: fitted.operator.pairs,
+            rank: fitted.operator.rank,
+            condition: fitted.operator.condition(),
+        },
+        score: report,
+        unscored,
+    };
+    if args.json { print_json(&report) } else { print(&fit_text(&report)) }
+}
+
+fn fit_text(report: &FitReport<'_>) -> String {
+    let (model, fit) = (&report.model, &report.fit);
+    let truncation = if fit.method == "svd" {
+        format!(", truncation {}", fit.truncation)
+    } else {
+        String::new()
+    };
+    let scaled = if fit.scale_columns { "columns scaled" } else { "columns not scaled" };
+    let mut text = format!(
+        "{}: {} trajectories, {} rows, {} snapshot pairs\n\
+         dictionary: {} terms, {} outputs, largest lag {}\n",
+        report.robot,
+        grouped(fit.trajectories as u64),
+        grouped(fit.rows),
+        grouped(fit.pairs),
+        model.terms,
+        model.outputs,
+        model.lag
+    );
+    const SHOWN: usize = 6;
+    for block in model.blocks.iter().take(SHOWN) {
+        text += &format!("  {block}\n");
+    }
+    if model.blocks.len() > SHOWN {
+        text += &format!("  and {} more blocks\n", model.blocks.len() - SHOWN);
+    }
+    text += &format!(
+        "fit: {}, {scaled}, ridge {}{truncation}; numerical rank {} of {}, condition number {}\n\
+         model: {}, {} bytes, {} of them coefficients ({} of {} zero)\n",
+        fit.method,
+        fit.ridge,
+        fit.rank,
+        model.terms,
+        significant(fit.condition),
+        model.file,
+        grouped(model.bytes as u64),
+        grouped(4 * model.coefficients as u64),
+        model.zeros,
+        model.coefficients
+    );
+    if let Some(score) = &report.score {
+        text += &format!("\n{}", score.table(false));
+    }
+    if let Some(reason) = &report.unscored {
+        text += &format!("\nnot scored: {reason}\n");
+    }
+    text
+}
+
+/// Names and units of the states.
+fn labels<'s>(structure: &'s Structure<'_>) -> Vec<(&'s str, &'s str)> {
+    structure.states().iter().map(|s| (s.name, s.unit)).collect()
+}
+
+/// Bytes of a blob at an address that the core accepts.
+struct BlobFile {
+    words: Vec<u32>,
+    length: usize,
+}
+
+impl BlobFile {
+    fn read(path: &Path) -> Result<Self, Failure> {
+        let bytes =
+            std::fs::read(path).map_err(|e| format!("{}: cannot be read: {e}", path.display()))?;
+        let mut words = vec![0_u32; bytes.len().div_ceil(4)];
+        bytemuck::cast_slice_mut(&mut words)[..bytes.len()].copy_from_slice(&bytes);
+        Ok(Self { words, length: bytes.len() })
+    }
+
+    fn bytes(&self) -> &[u8] {
+        &bytemuck::cast_slice(&self.words)[..self.length]
+    }
+}
+
+fn refused(path: &Path, error: blob::ParseError) -> Failure {
+    use blob::ParseError::{
+        Checksum, Magic, SelfTest, Trailing, Truncated, UnknownSection, Version,
+    };
+    let reason = match error {
+        Magic => {
+            "this is not a model blob; expected a file that `trainer fit` has written".to_owned()
+        }
+        Version { found } => {
+            format!(
+                "format version {found}; this program reads version {}: fit the model again",
+                blob::VERSION
+            )
+        }
+        Truncated { expected, found } => {
+            format!("{found} bytes of {expected}: the file is cut off; copy or fit it again")
+        }
+        Trailing { expected, found } => {
+            format!(
+                "{found} bytes where the blob has {expected}: something was appended; copy or fit it again"
+            )
+        }
+        Checksum { .. } => {
+            "the checksum does not match: the file is damaged; copy or fit it again".to_owned()
+        }
+        UnknownSection { kind, .. } => {
+            format!(
+                "a section of kind {kind:#06x} that this program does not know: it is older than the model"
+            )
+        }
+        SelfTest { .. } => {
+            "the stored prediction is not reproduced: this program computes something else"
+                .to_owned()
+        }
+        other => format!("{other:?}"),
+    };
+    Failure(format!("{}: {reason}", path.display()))
+}
+
+/// The columns of a log, from the description beside the blob or the blob itself; and the options
+/// for scoring.
+fn log_schema(
+    args: &EvaluateArgs,
+    model: &Model<'_>,
+) -> Result<(LogSchema, ScoreOptions), Failure> {
+    let structure = model.structure();
+    let beside = args.model.parent().unwrap_or(Path::new("")).join("robot.toml");
+    let description = args.robot.clone().or_else(|| beside.is_file().then_some(beside));
+    let (schema, mut options) = match description {
+        Some(path) => {
+            let robot = Robot::load(&path)?;
+            let states = robot.states.iter().map(|s| (s.name.as_str(), s.unit.as_str(), s.space));
+            let inputs = robot.inputs.iter().map(|u| (u.name.as_str(), u.unit.as_str()));
+            if robot.name != structure.robot()
+                || !states.eq(structure.states().iter().map(|s| (s.name, s.unit, s.space)))
+                || !inputs.eq(structure.inputs().iter().map(|u| (u.name, u.unit)))
+            {
+                return Err(Failure(format!(
+                    "{}: the model belongs to `{}`, but {} describes `{}` or other states and inputs; \
+                     give the right one with --robot",
+                    args.model.display(),
+                    structure.robot(),
+                    path.display(),
+                    robot.name
+                )));
+            }
+            (robot.schema, robot.score)
+        }
+        None => {
+            let states = structure.states().iter().map(|s| LogColumn::new(s.name, s.unit));
+            let inputs = structure.inputs().iter().map(|u| LogColumn::new(u.name, u.unit));
+            let dt = f64::from(structure.sample_time_s());
+            (LogSchema::new(dt, states.collect(), inputs.collect()), ScoreOptions::default())
+        }
+    };
+    options.hold_out.clear();
+    if let Some(horizon) = args.horizon {
+        options.horizon = horizon as usize;
+    }
+    if let Some(stride) = args.stride {
+        options.stride = stride as usize;
+    }
+    Ok((schema, options))
+}
+
+/// `evaluate --json`.
+#[derive(Serialize)]
+struct EvaluateReport<'r> {
+    format: u32,
+    command: &'static str,
+    robot: &'r str,
+    model: String,
+    logs: String,
+    score: ScoreReport,
+}
+
+fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
+    let file = BlobFile::read(&args.model)?;
+    let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let (schema, options) = log_schema(args, &model)?;
+    let recording = Recording::open(&args.logs)?;
+    let source = Logs { recording: &recording, schema: &schema };
+    let training = args.train.as_deref().map(Recording::open).transpose()?;
+    let scoring = bar("scoring", recording.bytes());
+    let progress = |bytes| scoring.set_position(bytes);
+
+    let run = |predictions: Option<&mut dyn Write>| -> Result<score::Score, Failure> {
+        match &training {
+            None => {
+                let counts = score::count(&source, &[])?;
+                Ok(score::score(
+                    &source,
+                    counts,
+                    Lifted::Given(&model),
+                    &options,
+                    predictions,
+                    &progress,
+                )?)
+            }
+            Some(training) => {
+                let training = Logs { recording: training, schema: &schema };
+                let counts = score::count(&training, &[])?;
+                let training = (&training, counts);
+                Ok(score::score_elsewhere(
+                    &source,
+                    training,
+                    &model,
+                    &options,
+                    predictions,
+                    &progress,
+                )?)
+            }
+        }
+    };
+    let mut outcome = None;
+    let written = match &args.csv {
+        None => {
+            outcome = Some(run(None));
+            Ok(())
+        }
+        Some(path) => write_whole(path, |out| {
+            let result = run(Some(out));
+            let failed = result.is_err();
+            outcome = Some(result);
+            // The file must not appear when there is no score.
+            if failed { Err(std::io::Error::other("not scored")) } else { Ok(()) }
+        }),
+    };
+    scoring.finish_and_clear();
+    let score = match outcome {
+        Some(result) => result?,
+        None => return written.map_err(Failure::from),
+    };
+    written?;
+    let structure = model.structure();
+    let report = EvaluateReport {
+        format: 1,
+        command: "evaluate",
+        robot: structure.robot(),
+        model: args.model.display().to_string(),
+        logs: args.logs.display().to_string(),
+        score: ScoreReport::new(&score, &labels(structure)),
+    };
+    if args.json {
+        return print_json(&report);
+    }
+    print(&format!("{} on {}\n{}", report.model, report.logs, report.score.table(true)))
+}
+
+fn show_blob(args: &InspectArgs) -> Result<(), Failure> {
+    let file = BlobFile::read(&args.model)?;
+    let inspection = inspect(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    if args.json { print_json(&inspection) } else { print(&inspection.text(args.all)) }
+}
+
+/// `dictionary --json`.
+#[derive(Serialize)]
+struct DictionaryReport<'r> {
+    format: u32,
+    command: &'static str,
+    topology: &'r str,
+    state_functions: &'r str,
+    functions: &'r str,
+    terms: &'r [String],
+}
+
+fn dictionary(args: &DictionaryArgs) -> Result<(), Failure> {
+    let mut orders = Orders { common: 1, by_name: Vec::new() };
+    for order in &args.order {
+        let bad =
+            || Failure(format!("--order {order}: expected a whole number, or NAME=N such as u1=3"));
+        match order.split_once('=') {
+            None => orders.common = order.trim().parse().map_err(|_| bad())?,
+            Some((name, n)) => {
+                orders.by_name.push((name.trim().to_owned(), n.trim().parse().map_err(|_| bad())?));
+            }
+        }
+    }
+    let lifting = lifting(&args.topology, args.inputs.into(), &orders)?;
+    if args.json {
+        return print_json(&DictionaryReport {
+            format: 1,
+            command: "dictionary",
+            topology: &args.topology,
+            state_functions: &lifting.state_functions,
+            functions: &lifting.functions,
+            terms: &lifting.terms,
+        });
+    }
+    let states: Vec<String> = lifting
+        .states
+        .iter()
+        .map(|(name, angle)| format!("{name} on {}", if *angle { "S^1" } else { "R" }))
+        .collect();
+    let mut text = format!("states      {}\n", states.join(", "));
+    if !lifting.inputs.is_empty() {
+        text += &format!("inputs      {}\n", lifting.inputs.join(", "));
+    }
+    text += &format!("D(x)        {}\n", lifting.state_functions);
+    if !lifting.inputs.is_empty() {
+        text += &format!("dictionary  {}\n", lifting.functions);
+    }
+    text += &format!(
+        "Hp(v) = [1, v, H2(v), ..., Hp(v)]; the first factor is the slowest index\n\n{} terms\n",
+        lifting.terms.len()
+    );
+    for term in &lifting.terms {
+        text += &format!("  {term}\n");
+    }
+    print(&text)
+}
+
+fn resample_logs(args: &ResampleArgs) -> Result<(), Failure> {
+    let recording = Recording::open(&args.logs)?;
+    let (schema, angles) = match &args.robot {
+        Some(path) => {
+            let robot = Robot::load(path)?;
+            let angles = robot.states.iter().map(|s| s.space == Space::Circle).collect();
+            (robot.schema, angles)
+        }
+        None => columns_by_name(args, &recording)?,
+    };
+    let mut plan = ResamplePlan::new(args.dt, schema);
+    plan.angles = angles;
+    if args.mean_inputs {
+        plan.inputs = InputResampling::Mean;
+    }
+    if let Some(gap) = args.max_gap {
+        plan.max_gap_s = gap;
+    }
+    let report = resample(&recording, &plan, &args.out)?;
+    print(&format!(
+        "{}: {} trajectories with {} rows, step {} s; {} gaps, {} pieces too short to keep\n",
+        args.out.display(),
+        report.files.len(),
+        grouped(report.rows),
+        args.dt,
+        report.gaps,
+        report.dropped
+    ))
+}
+
+/// Columns by the names on the command line: what is no input is a state.
+fn columns_by_name(
+    args: &ResampleArgs,
+    recording: &Recording,
+) -> Result<(LogSchema, Vec<bool>), Failure> {
+    let columns = recording.columns()?;
+    let named = args.inputs.iter().chain(&args.angles).chain(&args.degrees);
+    if let Some(missing) = named.into_iter().find(|name| !columns.contains(name)) {
+        return Err(Failure(format!(
+            "`{missing}` is not a column of the logs, which have {}",
+            columns.join(", ")
+        )));
+    }
+    let column = |name: &String| {
+        let mut column = LogColumn::new(name.as_str(), "");
+        column.column = Some(name.clone());
+        if args.degrees.contains(name) {
+            column.factor = std::f64::consts::PI / 180.0;
+        }
+        column
+    };
+    let is_state = |name: &&String| {
+        **name != args.time && Some(*name) != args.episode.as_ref() && !args.inputs.contains(name)
+    };
+    let states: Vec<&String> = columns.iter().filter(is_state).collect();
+    let angles =
+        states.iter().map(|n| args.angles.contains(n) || args.degrees.contains(n)).collect();
+    let mut schema = LogSchema::new(
+        args.dt,
+        states.into_iter().map(column).collect(),
+        args.inputs.iter().map(column).collect(),
+    );
+    schema.time.clone_from(&args.time);
+    schema.episode.clone_from(&args.episode);
+    Ok((schema, angles))
+}

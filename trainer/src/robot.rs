@@ -1,5 +1,6 @@
 //! `robot.toml`: the robot, what its logs are called, its dictionary, and how to fit and score.
 
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
@@ -404,7 +405,7 @@ impl Robot {
                 (Some(TargetToml::Absolute) | None, false) => Target::Absolute,
             };
             if let Some([low, high]) = s.limit
-                && !(low < high)
+                && low.partial_cmp(&high) != Some(Ordering::Less)
             {
                 return fail(format!("states[{i}].limit"), "expected [low, high] with low < high");
             }

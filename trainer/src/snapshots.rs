@@ -47,6 +47,11 @@ impl<'s, 'a, P: PairSink> Snapshots<'s, 'a, P> {
         }
     }
 
+    /// The sink, while pairs are still coming.
+    pub fn sink_mut(&mut self) -> &mut P {
+        &mut self.sink
+    }
+
     /// The sink.
     pub fn into_sink(self) -> P {
         self.sink
