@@ -71,27 +71,33 @@ impl<S: Scalar> History<S> {
         newest
     }
 
-    /// Takes the next sample. `input` acted from the present sample to it; before the first sample
-    /// it is ignored.
+    /// Takes a measured sample. `input` acted from the present sample to it; before the first
+    /// sample it is ignored.
     #[inline]
     pub fn push(&mut self, structure: &Structure<'_>, input: &[S], next: &Sample<S>) {
+        let mut next = *next;
+        if structure.needs_increments() && self.filled > 0 {
+            next.increment = structure.increment(self.newest(), &next);
+        }
+        self.advance(structure, input, &next);
+    }
+
+    /// Takes a predicted sample, as [`retract`](Self::retract) made it.
+    #[inline]
+    pub(crate) fn advance(&mut self, structure: &Structure<'_>, input: &[S], next: &Sample<S>) {
         let [newest, ..] = &mut self.samples;
         for (to, u) in newest.input.iter_mut().zip(input) {
             *to = *u;
         }
-        let needed = structure.needs_increments() && self.filled > 0;
-        let increment = needed.then(|| structure.increment(newest, next));
         let kept = structure.lag().min(MAX_LAG);
         if kept > 0 {
             self.samples.copy_within(..kept, 1);
         }
         let [newest, ..] = &mut self.samples;
         *newest = *next;
-        if let Some(increment) = increment {
-            newest.increment = increment;
-        }
-        // No more than are kept: a state that goes to a model with more lags is not ready.
-        self.filled = self.filled.saturating_add(1).min(kept as u8 + 1);
+        // Only what a later step may look at is kept: another model is not shown stale samples.
+        let room = u8::try_from(kept).unwrap_or(u8::MAX).saturating_add(1);
+        self.filled = self.filled.saturating_add(1).min(room);
     }
 
     /// The present coordinates in `out`, shape `[states]`: angles in (−π, π] where the model
@@ -174,13 +180,20 @@ impl<S: Scalar> History<S> {
             let z = outputs.next()?;
             let (x, sin, cos) = (next.x.get_mut(i)?, next.sin.get_mut(i)?, next.cos.get_mut(i)?);
             match (state.target, state.space) {
-                (Target::Increment, _) => *x = z,
+                (Target::Increment, space) => {
+                    // Hundreds of turns within a step would only look fine once they are wrapped.
+                    if space == Space::Circle && z.abs() > S::from_f32(LONG) {
+                        return None;
+                    }
+                    *x = z;
+                    *next.increment.get_mut(i)? = z;
+                }
                 (Target::Absolute, Space::Line) => *x = z,
                 (Target::Absolute, Space::Circle) => {
                     let c = outputs.next()?;
                     let radius = (z * z + c * c).sqrt();
-                    // Shorter than this, the direction is mostly noise; also catches NaN.
-                    if !(radius > S::from_f32(1e-3) && radius.is_finite()) {
+                    // Far from the circle the direction means nothing; also catches NaN.
+                    if !(radius > S::from_f32(1.0 / LONG) && radius < S::from_f32(LONG)) {
                         return None;
                     }
                     (*sin, *cos) = (z / radius, c / radius);
@@ -218,9 +231,20 @@ impl<S: Scalar> History<S> {
                 return None;
             }
         }
+        if structure.needs_increments() {
+            for (i, state) in structure.states().iter().enumerate() {
+                if state.target == Target::Absolute {
+                    *next.increment.get_mut(i)? = structure.change(present, &next, i);
+                }
+            }
+        }
         Some(next)
     }
 }
+
+/// How far from the circle (sin, cos) may be, as a factor, and how far an angle may turn within a
+/// step \[rad\], before a prediction counts as diverged.
+const LONG: f32 = 1e3;
 
 impl Structure<'_> {
     /// A sample from coordinates, shape `[states]`, angles in radians; missing ones are 0.
@@ -247,18 +271,26 @@ impl Structure<'_> {
         if absolute_angle { at(&sample.sin, i).atan2(at(&sample.cos, i)) } else { at(&sample.x, i) }
     }
 
+    /// The change of a coordinate, wrapped on S¹.
+    #[inline]
+    fn change<S: Scalar>(&self, from: &Sample<S>, to: &Sample<S>, i: usize) -> S {
+        let change = self.coordinate(to, i) - self.coordinate(from, i);
+        match self.states().get(i).map(|s| s.space) {
+            Some(Space::Circle) => change.wrap(),
+            _ => change,
+        }
+    }
+
     /// The increments of all coordinates from one sample to the next: wrapped on S¹, the pose of an
     /// se(2)-symmetric model in the frame of `from`.
     #[inline]
     fn increment<S: Scalar>(&self, from: &Sample<S>, to: &Sample<S>) -> [S; MAX_STATES] {
         let mut increment = [S::ZERO; MAX_STATES];
         for (i, (d, state)) in increment.iter_mut().zip(self.states()).enumerate() {
-            let change = || self.coordinate(to, i) - self.coordinate(from, i);
-            match state.space {
-                Space::Line => *d = change(),
-                // Two arc tangents for nothing if no one reads it.
-                Space::Circle if state.target == Target::Absolute && !self.needs_increments() => {}
-                Space::Circle => *d = change().wrap(),
+            // Two arc tangents for nothing if no one reads the change of an absolute angle.
+            let absolute_angle = (state.target, state.space) == (Target::Absolute, Space::Circle);
+            if !absolute_angle || self.needs_increments() {
+                *d = self.change(from, to, i);
             }
         }
         if let Symmetry::Se2 { x, y, heading } = self.symmetry() {

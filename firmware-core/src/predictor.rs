@@ -41,6 +41,11 @@ pub enum PredictError {
         /// Index of the coordinate.
         coordinate: usize,
     },
+    /// An input is NaN or infinite.
+    InputNotFinite {
+        /// Index of the input.
+        input: usize,
+    },
     /// The prediction left the finite numbers, a hard limit of the model, or the circle.
     Diverged {
         /// The step that failed; 1 is the first step after the last measurement.
@@ -142,7 +147,8 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     /// first measurement `applied` may be empty.
     ///
     /// # Errors
-    /// [`PredictError::DimensionMismatch`] and [`PredictError::NotFinite`]; the state is unchanged.
+    /// [`PredictError::DimensionMismatch`], [`PredictError::NotFinite`] and
+    /// [`PredictError::InputNotFinite`]; the state is unchanged.
     pub fn observe(
         &self,
         state: &mut PredictorState<S>,
@@ -152,7 +158,7 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         let structure = self.model.structure();
         expect("coordinates", structure.states().len(), coordinates.len())?;
         if !(state.history.is_empty() && applied.is_empty()) {
-            expect("inputs", structure.inputs().len(), applied.len())?;
+            expect_inputs(structure.inputs().len(), applied)?;
         }
         if let Some(coordinate) = coordinates.iter().position(|x| !x.is_finite()) {
             return Err(PredictError::NotFinite { coordinate });
@@ -168,11 +174,11 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     ///
     /// # Errors
     /// [`PredictError::NotReady`] until the history is full, [`PredictError::DimensionMismatch`],
-    /// [`PredictError::Diverged`]; the state is unchanged.
+    /// [`PredictError::InputNotFinite`], [`PredictError::Diverged`]; the state is unchanged.
     #[inline]
     pub fn step(&self, state: &mut PredictorState<S>, input: &[S]) -> Result<(), PredictError> {
         let structure = self.model.structure();
-        expect("inputs", structure.inputs().len(), input.len())?;
+        expect_inputs(structure.inputs().len(), input)?;
         let (have, need) = (state.history.len(), structure.lag().saturating_add(1));
         if have < need {
             return Err(PredictError::NotReady { have, need });
@@ -197,7 +203,7 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
                 .first_out_of_range(&state.history, input)
                 .map(|observable| OutOfRange { step, observable });
         }
-        state.history.push(structure, input, &next);
+        state.history.advance(structure, input, &next);
         state.step = step;
         Ok(())
     }
@@ -277,6 +283,14 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     fn dimensions(&self) -> (usize, usize) {
         let structure = self.model.structure();
         (structure.states().len().clamp(1, MAX_STATES), structure.inputs().len())
+    }
+}
+
+fn expect_inputs<S: Scalar>(expected: usize, input: &[S]) -> Result<(), PredictError> {
+    expect("inputs", expected, input.len())?;
+    match input.iter().position(|u| !u.is_finite()) {
+        Some(input) => Err(PredictError::InputNotFinite { input }),
+        None => Ok(()),
     }
 }
 

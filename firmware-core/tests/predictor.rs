@@ -669,7 +669,28 @@ fn inputs_that_are_no_numbers() {
         let predictor = Predictor::new(&model);
         let mut state = fixtures::fill(&predictor, &mut Numbers(5));
         for bad in [f64::NAN, f64::INFINITY].into_iter().filter(|_| m > 0) {
-            assert_diverges(&predictor, &mut state, &vec![bad; m], 1);
+            let (inputs, before) = (vec![bad; m], state.clone());
+            let expected = Err(PredictError::InputNotFinite { input: 0 });
+            assert_eq!(predictor.step(&mut state, &inputs), expected);
+            let n = model.structure().states().len();
+            assert_eq!(predictor.observe(&mut state, &inputs, &vec![0.0; n]), expected);
+            assert_eq!(state, before);
+        }
+    }
+}
+
+#[test]
+fn an_angle_that_turns_hundreds_of_times_in_a_step() {
+    let repr = one_coordinate(Space::Circle, Target::Increment, UNBOUNDED);
+    for (turn, diverges) in [(500.0, false), (2e3, true), (-2e3, true), (1e13, true)] {
+        let model = model(&repr, &[turn, 0.0, 0.0]);
+        let predictor = Predictor::new(&model);
+        let mut state: PredictorState = PredictorState::new();
+        predictor.observe(&mut state, &[], &[2.0]).unwrap();
+        if diverges {
+            assert_diverges(&predictor, &mut state, &[0.0], 1);
+        } else {
+            predictor.step(&mut state, &[0.0]).unwrap();
         }
     }
 }
