@@ -10,10 +10,10 @@
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-use crate::Number;
 use crate::capacity::{
     MAX_BASIS, MAX_BLOCK_FACTORS, MAX_BLOCKS, MAX_FACTORS, MAX_OBSERVABLES, MAX_ORDER, MAX_TERMS,
 };
+use crate::{Number, Scalar};
 
 /// What an observable reads. The number is the index of the state coordinate or input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,6 +42,14 @@ pub struct Observable {
     pub centre: f32,
     /// Reciprocal of the scale, in one over the unit; 1 for sine and cosine.
     pub gain: f32,
+}
+
+impl Observable {
+    /// `(raw − centre) · gain`.
+    #[inline]
+    pub fn value<S: Scalar>(&self, raw: S) -> S {
+        (raw - S::from_f32(self.centre)) * S::from_f32(self.gain)
+    }
 }
 
 /// The basis of a factor.

@@ -75,11 +75,12 @@ impl<S: Scalar> History<S> {
     /// sample it is ignored.
     #[inline]
     pub fn push(&mut self, structure: &Structure<'_>, input: &[S], next: &Sample<S>) {
-        let mut next = *next;
         if structure.needs_increments() && self.filled > 0 {
-            next.increment = structure.increment(self.newest(), &next);
+            let increment = structure.increment(self.newest(), next);
+            self.advance(structure, input, &Sample { increment, ..*next });
+        } else {
+            self.advance(structure, input, next);
         }
-        self.advance(structure, input, &next);
     }
 
     /// Takes a predicted sample, as [`retract`](Self::retract) made it.
@@ -136,7 +137,7 @@ impl<S: Scalar> History<S> {
     pub fn observe(&self, structure: &Structure<'_>, input: &[S], out: &mut [S]) {
         let observables = structure.dictionary().observables();
         for ((to, o), raw) in out.iter_mut().zip(observables).zip(self.raw(structure, input)) {
-            *to = (raw - S::from_f32(o.centre)) * S::from_f32(o.gain);
+            *to = o.value(raw);
         }
     }
 

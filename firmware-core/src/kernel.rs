@@ -1,11 +1,15 @@
 //! Evaluating the operator: the contraction of a Kronecker block with its coefficients.
 //!
 //! The coefficients of one output over a block are a tensor with one axis per factor, the first
-//! factor slowest. Every axis is folded in turn, the last one first: a polynomial factor by
-//! Horner's scheme `lo + v · hi` in monomials, a Fourier factor by a dot product from the last
-//! harmonic to the first. No term of the dictionary is ever formed: a block of n terms costs n − 1
-//! multiply-adds per output. Multiplication and addition are separate roundings on every machine,
-//! and the order is fixed, so that all kernels give the same bits.
+//! factor slowest. Every axis is folded in turn: a polynomial factor by Horner's scheme
+//! `lo + v · hi` in monomials, a Fourier factor by a dot product from the last harmonic to the
+//! first. No term of the dictionary is ever formed: a block of n terms costs n − 1 multiply-adds per
+//! output.
+//!
+//! Multiplication and addition are separate roundings on every machine, and the order is fixed, so
+//! that all kernels give the same bits: first the last factors, as many as have together at most 16
+//! coefficients (what a Cortex-M4F loads into its registers at once), the slowest of them first;
+//! then the others, the fastest first.
 
 use heapless::Vec;
 
@@ -13,35 +17,32 @@ use crate::Scalar;
 use crate::capacity::{MAX_BASIS, MAX_BLOCK_FACTORS};
 use crate::dictionary::{Basis, Factor, basis_functions, observable_pair};
 
-/// Blocks are folded on the stack in tiles of at most this many coefficients.
-const TILE: usize = 64;
+/// Coefficients of the last factors, which are folded slowest first.
+const REGISTERS: usize = 16;
+/// Coefficients are folded on the stack in tiles of at most this many.
+const TILE: usize = 256;
+/// Room for the Fourier functions of a block: the radices of a block whose product is at most
+/// [`MAX_TERMS`](crate::capacity::MAX_TERMS) add up to less.
+const FUNCTIONS: usize = 64;
 
 /// A factor as the contraction sees it.
 #[derive(Clone, Copy, Debug)]
-enum Fold<S> {
+enum Fold<'f, S> {
     /// Horner's scheme in `v` over `radix` coefficients.
     Polynomial { radix: usize, v: S },
     /// A dot product with these functions.
-    Functions { radix: usize, basis: [S; MAX_BASIS] },
+    Functions { functions: &'f [S] },
 }
 
-impl<S: Scalar> Fold<S> {
-    fn new(factor: Factor, values: &[S]) -> Self {
-        let radix = factor.radix();
-        match factor.basis {
-            Basis::Hermite => Self::Polynomial { radix, v: observable_pair(factor, values).0 },
-            Basis::Fourier => {
-                let mut basis = [S::ZERO; MAX_BASIS];
-                basis_functions(factor, values, &mut basis);
-                Self::Functions { radix, basis }
-            }
-        }
-    }
+/// A factor and how far apart the coefficients are that it folds.
+type Axis<'f, S> = (Fold<'f, S>, usize);
 
+impl<S: Scalar> Fold<'_, S> {
     #[inline]
     fn radix(&self) -> usize {
         match self {
-            Self::Polynomial { radix, .. } | Self::Functions { radix, .. } => *radix,
+            Self::Polynomial { radix, .. } => *radix,
+            Self::Functions { functions } => functions.len(),
         }
     }
 
@@ -54,8 +55,8 @@ impl<S: Scalar> Fold<S> {
                 let last = values.next().unwrap_or_default();
                 values.fold(last, |hi, lo| lo + *v * hi)
             }
-            Self::Functions { radix, basis } => {
-                let mut functions = basis.iter().take(*radix).rev();
+            Self::Functions { functions } => {
+                let mut functions = functions.iter().rev();
                 let first = functions.next().copied().unwrap_or_default();
                 let last = first * values.next().unwrap_or_default();
                 values.zip(functions).fold(last, |sum, (c, h)| sum + *h * c)
@@ -63,18 +64,28 @@ impl<S: Scalar> Fold<S> {
         }
     }
 
-    /// All groups of `from` into `to`; returns how many there were.
+    /// Folds the axis of `from`, shape `[groups, radix, stride]`, into `to`, shape
+    /// `[groups, stride]`; returns how many numbers that is.
     #[inline]
-    fn level(&self, from: &[S], to: &mut [S]) -> usize {
-        match self {
-            Self::Polynomial { radix: 2, v } => horner::<S, 2>(*v, from, to),
-            Self::Polynomial { radix: 3, v } => horner::<S, 3>(*v, from, to),
-            Self::Polynomial { radix: 4, v } => horner::<S, 4>(*v, from, to),
+    fn level(&self, stride: usize, from: &[S], to: &mut [S]) -> usize {
+        match (self, stride) {
+            (Self::Polynomial { radix: 2, v }, 8) => rows::<S, 2, 8>(*v, from, to),
+            (Self::Polynomial { radix: 2, v }, 4) => rows::<S, 2, 4>(*v, from, to),
+            (Self::Polynomial { radix: 2, v }, 2) => rows::<S, 2, 2>(*v, from, to),
+            (Self::Polynomial { radix: 2, v }, 1) => rows::<S, 2, 1>(*v, from, to),
+            (Self::Polynomial { radix: 3, v }, 3) => rows::<S, 3, 3>(*v, from, to),
+            (Self::Polynomial { radix: 3, v }, 1) => rows::<S, 3, 1>(*v, from, to),
+            (Self::Polynomial { radix: 4, v }, 4) => rows::<S, 4, 4>(*v, from, to),
+            (Self::Polynomial { radix: 4, v }, 1) => rows::<S, 4, 1>(*v, from, to),
             _ => {
-                let groups = from.chunks_exact(self.radix().max(1));
-                let count = groups.len();
-                for (out, group) in to.iter_mut().zip(groups) {
-                    *out = self.group(group.iter().copied());
+                let stride = stride.max(1);
+                let group = self.radix().saturating_mul(stride).max(1);
+                let mut count = 0_usize;
+                for (to, from) in to.chunks_mut(stride).zip(from.chunks_exact(group)) {
+                    for (offset, out) in to.iter_mut().enumerate() {
+                        *out = self.group(from.iter().skip(offset).step_by(stride).copied());
+                        count = count.saturating_add(1);
+                    }
                 }
                 count
             }
@@ -82,22 +93,33 @@ impl<S: Scalar> Fold<S> {
     }
 }
 
-/// Horner's scheme over groups whose size is known: unrolled and vectorised by the compiler.
-#[inline]
-fn horner<S: Scalar, const RADIX: usize>(v: S, from: &[S], to: &mut [S]) -> usize {
-    let (groups, _) = from.as_chunks::<RADIX>();
+/// [`Fold::level`] for Horner's scheme with a known shape: unrolled and vectorised by the compiler.
+#[inline(always)]
+fn rows<S: Scalar, const RADIX: usize, const STRIDE: usize>(
+    v: S,
+    from: &[S],
+    to: &mut [S],
+) -> usize {
+    let (rows, _) = from.as_chunks::<STRIDE>();
+    let (groups, _) = rows.as_chunks::<RADIX>();
+    let (to, _) = to.as_chunks_mut::<STRIDE>();
     for (out, group) in to.iter_mut().zip(groups) {
-        let mut rest = group.iter().rev().copied();
-        let last = rest.next().unwrap_or_default();
-        *out = rest.fold(last, |hi, lo| lo + v * hi);
+        let mut sum = group.last().copied().unwrap_or([S::ZERO; STRIDE]);
+        for row in group.iter().rev().skip(1) {
+            for (hi, lo) in sum.iter_mut().zip(row) {
+                *hi = *lo + v * *hi;
+            }
+        }
+        *out = sum;
     }
-    groups.len()
+    groups.len().saturating_mul(STRIDE)
 }
 
 /// Adds the contributions of one block to every output.
 ///
 /// `coefficients` has the outputs of a model one after the other, `stride` apart; the block's own
 /// start at the beginning of the slice. `outputs` has shape `[outputs]`.
+#[inline]
 pub(crate) fn contract<S: Scalar>(
     factors: &[Factor],
     values: &[S],
@@ -105,48 +127,91 @@ pub(crate) fn contract<S: Scalar>(
     stride: usize,
     outputs: &mut [S],
 ) {
-    let mut folds: Vec<Fold<S>, MAX_BLOCK_FACTORS> = Vec::new();
-    let (mut size, mut outer) = (1_usize, 0_usize);
+    // A checked dictionary has no more factors in a block, and no more functions in its factors.
+    let mut functions: Vec<S, FUNCTIONS> = Vec::new();
+    for factor in factors.iter().rev().filter(|f| f.basis == Basis::Fourier) {
+        let mut basis = [S::ZERO; MAX_BASIS];
+        let _ = functions.extend_from_slice(basis_functions(*factor, values, &mut basis));
+    }
+    let mut functions = functions.as_slice();
+    let mut folds: Vec<Axis<'_, S>, MAX_BLOCK_FACTORS> = Vec::new();
+    let (mut size, mut first, mut outer) = (1_usize, 0_usize, 0_usize);
     for factor in factors.iter().rev() {
         let radix = factor.radix();
+        let fold = match factor.basis {
+            Basis::Hermite => Fold::Polynomial { radix, v: observable_pair(*factor, values).0 },
+            Basis::Fourier => {
+                let (own, others) = functions.split_at_checked(radix).unwrap_or((functions, &[]));
+                functions = others;
+                Fold::Functions { functions: own }
+            }
+        };
+        let faster = size;
         size = size.saturating_mul(radix);
-        if size > TILE {
-            outer = outer.saturating_add(1);
+        if size <= REGISTERS {
+            first = first.saturating_add(1);
+            let _ = folds.push((fold, faster));
+        } else {
+            outer = outer.saturating_add(usize::from(size > TILE));
+            let _ = folds.push((fold, 1));
         }
-        // A checked dictionary has at most MAX_BLOCK_FACTORS factors in a block.
-        let _ = folds.push(Fold::new(*factor, values));
+    }
+    if let Some(first) = folds.get_mut(..first) {
+        first.reverse();
     }
     let (inner, outer) = folds.split_at(folds.len().saturating_sub(outer));
-    for (output, row) in outputs.iter_mut().zip(coefficients.chunks(stride.max(1))) {
+    if outer.is_empty() && size == stride {
+        // The only block: the outputs of a tile are one more axis, which is not folded.
+        let together = TILE.checked_div(size).unwrap_or(1).max(1);
+        let rows = coefficients.chunks(together.saturating_mul(size).max(1));
+        for (outputs, rows) in outputs.chunks_mut(together).zip(rows) {
+            contract_tile(inner, rows, outputs);
+        }
+        return;
+    }
+    for (output, row) in outputs.chunks_mut(1).zip(coefficients.chunks(stride.max(1))) {
         let block = row.get(..size).unwrap_or(&[]);
-        *output = *output + contract_tiles(inner, outer, block);
+        if outer.is_empty() {
+            contract_tile(inner, block, output);
+        } else if let [output] = output {
+            *output = *output + contract_tiles(inner, outer, block);
+        }
     }
 }
 
 /// Folds the outer axes (the last of `outer` is the slowest) over the results of the tiles.
-fn contract_tiles<S: Scalar>(inner: &[Fold<S>], outer: &[Fold<S>], c: &[S]) -> S {
+fn contract_tiles<S: Scalar>(inner: &[Axis<'_, S>], outer: &[Axis<'_, S>], c: &[S]) -> S {
     match outer.split_last() {
-        None => contract_tile(inner, c),
-        Some((slowest, faster)) => {
+        None => {
+            let mut result = [S::ZERO];
+            contract_tile(inner, c, &mut result);
+            let [result] = result;
+            result
+        }
+        Some(((slowest, _), faster)) => {
             let size = c.len().checked_div(slowest.radix()).unwrap_or(0).max(1);
             slowest.group(c.chunks_exact(size).map(|part| contract_tiles(inner, faster, part)))
         }
     }
 }
 
-/// Folds all axes of a tile; the first of `folds` is the fastest.
+/// Folds all axes of a tile in the order of `axes` and adds the results.
 #[inline]
-fn contract_tile<S: Scalar>(folds: &[Fold<S>], c: &[S]) -> S {
-    let Some((first, others)) = folds.split_first() else {
-        return c.first().copied().unwrap_or_default();
+fn contract_tile<S: Scalar>(axes: &[Axis<'_, S>], c: &[S], outputs: &mut [S]) {
+    let (mut a, mut b) = ([S::ZERO; TILE / 2], [S::ZERO; TILE / 4]);
+    let (mut from, mut to): (&mut [S], &mut [S]) = (&mut a, &mut b);
+    let results = match axes.split_first() {
+        None => c,
+        Some(((fold, stride), others)) => {
+            let mut len = fold.level(*stride, c, from);
+            for (fold, stride) in others {
+                len = fold.level(*stride, from.get(..len).unwrap_or(&[]), to);
+                core::mem::swap(&mut from, &mut to);
+            }
+            from
+        }
     };
-    let (mut a, mut b) = ([S::ZERO; TILE / 2], [S::ZERO; TILE / 2]);
-    let (mut from, mut to) = (&mut a, &mut b);
-    let mut len = first.level(c, from);
-    for fold in others {
-        len = fold.level(from.get(..len).unwrap_or(&[]), to);
-        core::mem::swap(&mut from, &mut to);
+    for (output, result) in outputs.iter_mut().zip(results) {
+        *output = *output + *result;
     }
-    let [result, ..] = *from;
-    result
 }

@@ -1,5 +1,7 @@
 //! Predicting: one step, or a rollout that lifts again at every step.
 
+use heapless::Vec;
+
 use crate::Scalar;
 use crate::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES};
 use crate::dictionary::block_size;
@@ -185,8 +187,21 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         }
         let step = state.step.saturating_add(1);
 
-        let mut values = [S::ZERO; MAX_OBSERVABLES];
-        state.history.observe(structure, input, &mut values);
+        // One pass over the observables: their range, and their value for the dictionary.
+        let mut values: Vec<S, MAX_OBSERVABLES> = Vec::new();
+        let mut outside = None;
+        let mut ranges = self.model.ranges().map_or(&[][..], |r| r.as_chunks().0).iter();
+        let observables = structure.dictionary().observables();
+        let raw = state.history.raw(structure, input);
+        for (observable, (raw, o)) in raw.zip(observables).enumerate() {
+            if let Some([low, high]) = ranges.next()
+                && !(raw >= *low && raw <= *high)
+            {
+                outside = outside.or(Some(OutOfRange { step, observable }));
+            }
+            // A checked dictionary has no more observables.
+            let _ = values.push(o.value(raw));
+        }
         let mut outputs = [S::ZERO; MAX_OUTPUTS];
         let outputs = outputs.get_mut(..structure.outputs()).unwrap_or_default();
         let stride = structure.dictionary().dense_terms();
@@ -198,24 +213,10 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         let diverged = PredictError::Diverged { step };
         let next = state.history.retract(structure, outputs).ok_or(diverged)?;
 
-        if state.out_of_range.is_none() {
-            state.out_of_range = self
-                .first_out_of_range(&state.history, input)
-                .map(|observable| OutOfRange { step, observable });
-        }
+        state.out_of_range = state.out_of_range.or(outside);
         state.history.advance(structure, input, &next);
         state.step = step;
         Ok(())
-    }
-
-    /// The first observable outside its trained range.
-    #[inline]
-    fn first_out_of_range(&self, history: &History<S>, input: &[S]) -> Option<usize> {
-        let (ranges, _) = self.model.ranges()?.as_chunks::<2>();
-        history
-            .raw(self.model.structure(), input)
-            .zip(ranges)
-            .position(|(raw, [low, high])| !(raw >= *low && raw <= *high))
     }
 
     /// The present coordinates in `out`, shape `[states]`: measured or predicted, whichever came

@@ -683,7 +683,8 @@ fn inputs_that_are_no_numbers() {
 fn an_angle_that_turns_hundreds_of_times_in_a_step() {
     let repr = one_coordinate(Space::Circle, Target::Increment, UNBOUNDED);
     for (turn, diverges) in [(500.0, false), (2e3, true), (-2e3, true), (1e13, true)] {
-        let model = model(&repr, &[turn, 0.0, 0.0]);
+        let coefficients = [turn, 0.0, 0.0];
+        let model = model(&repr, &coefficients);
         let predictor = Predictor::new(&model);
         let mut state: PredictorState = PredictorState::new();
         predictor.observe(&mut state, &[], &[2.0]).unwrap();

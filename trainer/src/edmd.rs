@@ -40,6 +40,14 @@ pub enum FitError<E> {
         /// The dependent ones, as [`Form::Hermite`](crate::terms::Form) indices of distinct terms.
         dependent: Vec<String>,
     },
+    /// The controller computes in f32.
+    #[error(
+        "`{observable}` goes beyond the controller's f32 numbers (3.4e38): log it in a larger unit"
+    )]
+    TooLarge {
+        /// Name of the observable.
+        observable: String,
+    },
     /// A number became infinite on the way: values too large for the orders of the dictionary.
     #[error(
         "a coefficient is not finite: the logs hold values too large for the orders of the dictionary"
@@ -373,8 +381,12 @@ pub fn fit<'r, T: Trajectories>(
     if extremes.is_empty() {
         return Err(FitError::NoPairs { need: structure.lag() + 2 });
     }
-    let operator = solve_named(robot, &structure, regression)?;
     let ranges = extremes.raw(&scaling);
+    if let Some(bound) = ranges.iter().position(|bound| !bound.is_finite()) {
+        let observable = crate::terms::observable_name(robot, robot.observables[bound / 2]);
+        return Err(FitError::TooLarge { observable });
+    }
+    let operator = solve_named(robot, &structure, regression)?;
 
     let mut limits = robot.limits();
     for (i, (limit, state)) in limits.iter_mut().zip(&robot.states).enumerate() {

@@ -140,10 +140,20 @@ pub fn write_whole(
     fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>,
 ) -> Result<(), WriteError> {
     let attempt = || -> std::io::Result<()> {
+        // A device or a pipe is never replaced by a file; what comes out of it cannot be whole.
+        if std::fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+            let mut buffered =
+                std::io::BufWriter::new(std::fs::OpenOptions::new().write(true).open(path)?);
+            fill(&mut buffered)?;
+            return buffered.flush();
+        }
         let folder = match path.parent() {
             Some(folder) if !folder.as_os_str().is_empty() => folder,
             _ => Path::new("."),
         };
+        if !folder.is_dir() {
+            return Err(std::io::Error::other("there is no such folder"));
+        }
         let mut builder = tempfile::Builder::new();
         builder.prefix(".trainer-");
         #[cfg(unix)]

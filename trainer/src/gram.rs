@@ -19,7 +19,7 @@ use crate::terms::distinct_terms;
 /// Samples side by side.
 const LANES: usize = 8;
 /// Groups of samples that are lifted and summed at once: the buffers of a chunk stay in the cache.
-const CHUNK: usize = 32;
+const CHUNK: usize = 16;
 /// Columns of the left and right matrix in a register tile.
 const TILE: (usize, usize) = (2, 4);
 
@@ -62,7 +62,7 @@ pub struct GramAccumulator {
     /// Shape `[terms, terms]`, upper tiles; without moments.
     gram: Vec<f64>,
     /// Shape `[outputs, terms]`.
-    cross: Vec<f64>,
+    cross: Vec<Lane>,
 }
 
 /// The distinct moments of a single block, split into a slow and a fast half.
@@ -75,7 +75,7 @@ struct Moments {
     /// Shape `[CHUNK, fast moments]`.
     fast: Vec<Lane>,
     /// Shape `[slow, fast]`.
-    sums: Vec<f64>,
+    sums: Vec<Lane>,
 }
 
 /// Number of distinct products of two basis functions of a factor.
@@ -104,7 +104,7 @@ impl Moments {
             split,
             slow: vec![Lane::ZERO; CHUNK * p],
             fast: vec![Lane::ZERO; CHUNK * q],
-            sums: vec![0.0; p * q],
+            sums: vec![Lane::ZERO; p * q],
         })
     }
 
@@ -133,7 +133,7 @@ impl Moments {
 
     /// Spreads the sums over `[dense terms, dense terms]`.
     fn gram(&self) -> Vec<f64> {
-        let mut tensor = self.sums.clone();
+        let mut tensor: Vec<f64> = self.sums.iter().copied().map(total).collect();
         // One axis after the other, from moments to pairs of basis functions.
         let mut after: usize = tensor.len();
         for factor in &self.factors {
@@ -291,12 +291,12 @@ pub fn hermite_powers(n: usize) -> Vec<f64> {
 /// numbers per sample p and q, `out` has shape `[p, q]`. With `upper`, tiles wholly below the
 /// diagonal are left alone.
 #[inline(always)]
-fn add_product<S: Simd>(
+fn add_product<S: Simd, A: Accumulate>(
     simd: S,
     groups: usize,
     (left, p): (&[Lane], usize),
     (right, q): (&[Lane], usize),
-    out: &mut [f64],
+    out: &mut [A],
     upper: bool,
 ) {
     let (left, right) = (&left[..groups * p], &right[..groups * q]);
@@ -332,10 +332,29 @@ fn add_product<S: Simd>(
             }
             for (out, sums) in out[i * q..].chunks_exact_mut(q).zip(sums) {
                 for (to, sum) in out[j..].iter_mut().zip(sums) {
-                    *to += total(sum);
+                    to.add(sum);
                 }
             }
         }
+    }
+}
+
+/// Where the sums of a chunk go: lane by lane where there is room, added up where there is not.
+trait Accumulate {
+    fn add(&mut self, sums: Lane);
+}
+
+impl Accumulate for Lane {
+    #[inline(always)]
+    fn add(&mut self, sums: Lane) {
+        *self = *self + sums;
+    }
+}
+
+impl Accumulate for f64 {
+    #[inline(always)]
+    fn add(&mut self, sums: Lane) {
+        *self += total(sums);
     }
 }
 
@@ -377,7 +396,7 @@ impl GramAccumulator {
             dense: vec![Lane::ZERO; dictionary.dense_terms()],
             moments,
             gram: vec![0.0; gram],
-            cross: vec![0.0; m * n],
+            cross: vec![Lane::ZERO; m * n],
             distinct,
         }
     }
@@ -468,7 +487,7 @@ impl GramAccumulator {
         let mut cross = vec![0.0; n * m];
         for (i, row) in cross.chunks_exact_mut(m).enumerate() {
             for (j, to) in row.iter_mut().enumerate() {
-                *to = self.cross[j * n + i];
+                *to = total(self.cross[j * n + i]);
             }
         }
         NormalEquations { terms: n, outputs: m, pairs: self.pairs, gram, cross }

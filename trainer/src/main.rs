@@ -12,7 +12,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use trainer::edmd;
 use trainer::export::{export, write_whole};
-use trainer::inspect::{blocks, inspect};
+use trainer::inspect::{Inspection, blocks, inspect};
 use trainer::recording::{LogColumn, LogSchema, Recording};
 use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
@@ -274,7 +274,9 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
         match scored {
             Ok(score) => report = Some(ScoreReport::new(&score, &labels(&fitted.structure))),
             Err(
-                error @ (score::ScoreError::NoWindow { .. } | score::ScoreError::Untrained { .. }),
+                error @ (score::ScoreError::NoWindow { .. }
+                | score::ScoreError::HoldOut { .. }
+                | score::ScoreError::Untrained { .. }),
             ) => {
                 unscored = Some(error.to_string());
             }
@@ -357,7 +359,7 @@ fn fit_text(report: &FitReport<'_>) -> String {
         fit.ridge,
         fit.rank,
         model.terms,
-        significant(fit.condition),
+        if fit.condition.is_finite() { significant(fit.condition) } else { "infinite".to_owned() },
         model.file,
         grouped(model.bytes as u64),
         grouped(4 * model.coefficients as u64),
@@ -454,10 +456,11 @@ fn log_schema(
             if robot.name != structure.robot()
                 || !states.eq(structure.states().iter().map(|s| (s.name, s.unit, s.space)))
                 || !inputs.eq(structure.inputs().iter().map(|u| (u.name, u.unit)))
+                || robot.schema.sample_time_s as f32 != structure.sample_time_s()
             {
                 return Err(Failure(format!(
-                    "{}: the model belongs to `{}`, but {} describes `{}` or other states and inputs; \
-                     give the right one with --robot",
+                    "{}: the model belongs to `{}`, but {} describes `{}` or other states, inputs or \
+                     sample time; give the right one with --robot",
                     args.model.display(),
                     structure.robot(),
                     path.display(),
@@ -469,7 +472,9 @@ fn log_schema(
         None => {
             let states = structure.states().iter().map(|s| LogColumn::new(s.name, s.unit));
             let inputs = structure.inputs().iter().map(|u| LogColumn::new(u.name, u.unit));
-            let dt = f64::from(structure.sample_time_s());
+            // The decimal number that was meant: 0.1, not 0.10000000149.
+            let dt = structure.sample_time_s();
+            let dt = dt.to_string().parse().unwrap_or(f64::from(dt));
             (LogSchema::new(dt, states.collect(), inputs.collect()), ScoreOptions::default())
         }
     };
@@ -567,10 +572,26 @@ fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     print(&format!("{} on {}\n{}", report.model, report.logs, report.score.table(true)))
 }
 
+/// `inspect --json`.
+#[derive(Serialize)]
+struct InspectReport<'i> {
+    format: u32,
+    command: &'static str,
+    #[serde(flatten)]
+    inspection: &'i Inspection,
+}
+
 fn show_blob(args: &InspectArgs) -> Result<(), Failure> {
     let file = BlobFile::read(&args.model)?;
     let inspection = inspect(file.bytes()).map_err(|e| refused(&args.model, e))?;
-    if args.json { print_json(&inspection) } else { print(&inspection.text(args.all)) }
+    if args.json {
+        return print_json(&InspectReport {
+            format: 1,
+            command: "inspect",
+            inspection: &inspection,
+        });
+    }
+    print(&inspection.text(args.all))
 }
 
 /// `dictionary --json`.

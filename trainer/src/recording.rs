@@ -95,12 +95,14 @@ pub struct LogSchema {
     pub states: Vec<LogColumn>,
     /// The inputs, in the order in which a row hands them on.
     pub inputs: Vec<LogColumn>,
+    /// The robot.toml that says all this, for the command that messages propose.
+    pub robot: Option<PathBuf>,
 }
 
 impl LogSchema {
     /// A schema with the time in `time_s` and one trajectory per file.
     pub fn new(sample_time_s: f64, states: Vec<LogColumn>, inputs: Vec<LogColumn>) -> Self {
-        Self { sample_time_s, time: "time_s".into(), episode: None, states, inputs }
+        Self { sample_time_s, time: "time_s".into(), episode: None, states, inputs, robot: None }
     }
 }
 
@@ -434,7 +436,7 @@ pub enum ReadError {
     },
     /// A time step is more than 5 % off the sample time.
     #[error("{}, row {line}, column `{column}`: {}", file.display(),
-        step_message(*fault, *found_s, *expected_s, logs))]
+        step_message(*fault, *found_s, *expected_s, command))]
     TimeStep {
         /// The file.
         file: PathBuf,
@@ -448,14 +450,14 @@ pub enum ReadError {
         found_s: f64,
         /// The sample time, in seconds.
         expected_s: f64,
-        /// The recording, as its path was given.
-        logs: PathBuf,
+        /// The command that puts the recording on an even grid.
+        command: String,
     },
 }
 
-fn step_message(fault: StepFault, found_s: f64, expected_s: f64, logs: &Path) -> String {
+fn step_message(fault: StepFault, found_s: f64, expected_s: f64, command: &str) -> String {
     let found = nanoseconds(found_s);
-    let command = format!("`trainer resample {} --dt {expected_s} --out DIR`", shell_word(logs));
+    let command = format!("`{command}`");
     match fault {
         StepFault::StandsStill => format!(
             "the time stands still: expected a step of {expected_s} s ± 5 %, found {found} s; \
@@ -481,6 +483,39 @@ fn step_message(fault: StepFault, found_s: f64, expected_s: f64, logs: &Path) ->
 /// Rounds a time in seconds to whole nanoseconds, so that `0.3 - 0.2` prints as `0.1`.
 pub(crate) fn nanoseconds(time_s: f64) -> f64 {
     (time_s * 1e9).round() / 1e9
+}
+
+/// The command that resamples `logs` as `schema` reads them. `columns` are the headers of the time,
+/// the states and the inputs.
+fn resample_command(logs: &Path, schema: &LogSchema, columns: &[String]) -> String {
+    let mut words = vec!["trainer".to_owned(), "resample".to_owned(), shell_word(logs)];
+    let mut option = |name: &str, value: &str| words.extend([name.to_owned(), value.to_owned()]);
+    option("--dt", &schema.sample_time_s.to_string());
+    if let Some(robot) = &schema.robot {
+        option("--robot", &shell_word(robot));
+    } else {
+        if schema.time != "time_s" {
+            option("--time", &shell_word(Path::new(&schema.time)));
+        }
+        if let Some(episode) = &schema.episode {
+            option("--episode", &shell_word(Path::new(episode)));
+        }
+        let (states, inputs) = columns[1..].split_at(schema.states.len());
+        let in_unit = |unit| {
+            let states = states.iter().zip(&schema.states);
+            states.filter(|(_, s)| s.unit == unit).map(|(c, _)| c.clone()).collect::<Vec<_>>()
+        };
+        let lists = [
+            ("--inputs", inputs.to_vec()),
+            ("--angles", in_unit("rad")),
+            ("--degrees", in_unit("deg")),
+        ];
+        for (name, list) in lists.into_iter().filter(|(_, list)| !list.is_empty()) {
+            option(name, &shell_word(Path::new(&list.join(","))));
+        }
+    }
+    option("--out", "DIR");
+    words.join(" ")
 }
 
 /// The path as one word of a POSIX shell.
@@ -631,7 +666,7 @@ impl Recording {
                     fault,
                     found_s: row.time_s - last_s,
                     expected_s,
-                    logs: self.path.clone(),
+                    command: resample_command(&self.path, schema, row.columns),
                 });
             }
             last_s = row.time_s;
@@ -1449,7 +1484,8 @@ mod tests {
                 file.display()
             );
             assert!(text.starts_with(&start), "{text}");
-            assert!(text.contains(&format!("`trainer resample {logs} --dt 0.1 --out DIR`")));
+            let options = "--dt 0.1 --inputs u --out DIR";
+            assert!(text.contains(&format!("`trainer resample {logs} {options}`")));
             assert!(matches!(error, ReadError::TimeStep { fault, line: 4, .. } if fault == kind));
         }
     }

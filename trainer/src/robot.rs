@@ -97,7 +97,21 @@ struct StateToml {
     unit: String,
     target: Option<TargetToml>,
     column: Option<String>,
-    limit: Option<[f64; 2]>,
+    limit: Option<Exactly<f64, 2>>,
+}
+
+/// A list of N values: serde itself takes an array from the front of a longer list.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(try_from = "Vec<T>", bound = "T: Deserialize<'de>")]
+struct Exactly<T, const N: usize>([T; N]);
+
+impl<T, const N: usize> TryFrom<Vec<T>> for Exactly<T, N> {
+    type Error = String;
+
+    fn try_from(list: Vec<T>) -> Result<Self, String> {
+        let list: Result<[T; N], _> = list.try_into();
+        list.map(Self).map_err(|list| format!("expected {N} values, found {}", list.len()))
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -106,7 +120,7 @@ struct InputToml {
     name: String,
     #[serde(default)]
     unit: String,
-    range: [f64; 2],
+    range: Exactly<f64, 2>,
     column: Option<String>,
 }
 
@@ -116,7 +130,7 @@ enum SymmetryToml {
     #[default]
     None,
     Translation(Vec<String>),
-    Se2([String; 3]),
+    Se2(Exactly<String, 3>),
 }
 
 #[derive(Debug, Deserialize)]
@@ -300,11 +314,11 @@ impl Robot {
             }
         })?;
         let sha256 = Sha256::digest(text.as_bytes()).into();
-        Self::check(toml, sha256).map_err(|(key, message)| RobotError::Meaning {
-            path: path.to_owned(),
-            key,
-            message,
-        })
+        let mut robot = Self::check(toml, sha256).map_err(|(key, message)| {
+            RobotError::Meaning { path: path.to_owned(), key, message }
+        })?;
+        robot.schema.robot = Some(path.to_owned());
+        Ok(robot)
     }
 
     fn check(toml: RobotToml, sha256: [u8; 32]) -> Result<Self, (String, String)> {
@@ -366,7 +380,7 @@ impl Robot {
                 }
                 Symmetry::Translation { coordinates }
             }
-            SymmetryToml::Se2([x, y, heading]) => Symmetry::Se2 {
+            SymmetryToml::Se2(Exactly([x, y, heading])) => Symmetry::Se2 {
                 x: coordinate(x)?,
                 y: coordinate(y)?,
                 heading: coordinate(heading)?,
@@ -379,6 +393,7 @@ impl Robot {
             episode: toml.episode_column.clone(),
             states: Vec::new(),
             inputs: Vec::new(),
+            robot: None,
         };
         let mut states = Vec::new();
         for (i, s) in toml.states.iter().enumerate() {
@@ -404,7 +419,8 @@ impl Robot {
                 (Some(TargetToml::Increment), _) | (None, true) => Target::Increment,
                 (Some(TargetToml::Absolute) | None, false) => Target::Absolute,
             };
-            if let Some([low, high]) = s.limit
+            let limit = s.limit.as_ref().map(|limit| limit.0);
+            if let Some([low, high]) = limit
                 && low.partial_cmp(&high) != Some(Ordering::Less)
             {
                 return fail(format!("states[{i}].limit"), "expected [low, high] with low < high");
@@ -422,12 +438,13 @@ impl Robot {
                 unit: if space == Space::Circle { circle_unit() } else { s.unit.clone() },
                 space,
                 target,
-                limit: s.limit.map(|limit| limit.map(|x| x * factor)),
+                limit: limit.map(|limit| limit.map(|x| x * factor)),
             });
         }
         let mut inputs = Vec::new();
         for (i, u) in toml.inputs.iter().enumerate() {
-            let [low, high] = u.range;
+            let Exactly(range) = u.range;
+            let [low, high] = range;
             if !(low < high && low.is_finite() && high.is_finite()) {
                 return fail(format!("inputs[{i}].range"), "expected [low, high] with low < high");
             }
@@ -437,7 +454,7 @@ impl Robot {
                 column: u.column.clone(),
                 factor: 1.0,
             });
-            inputs.push(RobotInput { name: u.name.clone(), unit: u.unit.clone(), range: u.range });
+            inputs.push(RobotInput { name: u.name.clone(), unit: u.unit.clone(), range });
         }
 
         let positive = |key: &str, value: f64| {
@@ -449,15 +466,18 @@ impl Robot {
         };
         positive("fit.ridge", toml.fit.ridge)?;
         positive("fit.truncation", toml.fit.truncation)?;
-        for (key, value) in
-            [("score.horizon", toml.score.horizon), ("score.stride", toml.score.stride)]
-        {
-            if value == 0 {
-                return fail(key.into(), "expected a whole number, 1 or more");
-            }
+        if toml.fit.truncation >= 1.0 {
+            return fail("fit.truncation".into(), "expected a number below 1, or nothing is left");
         }
-        if toml.score.folds < 2 {
-            return fail("score.folds".into(), "expected a whole number, 2 or more");
+        for (key, value, range) in [
+            ("score.horizon", toml.score.horizon, 1..=1_000_000),
+            ("score.stride", toml.score.stride, 1..=1_000_000),
+            ("score.folds", toml.score.folds, 2..=1_000),
+        ] {
+            if !range.contains(&value) {
+                let (low, high) = (range.start(), range.end());
+                return fail(key.into(), &format!("expected a whole number, {low} to {high}"));
+            }
         }
 
         let mut parts = DictionaryParts {

@@ -168,6 +168,18 @@ pub enum ScoreError<E> {
         /// Rows before the first predicted one.
         first: usize,
     },
+    /// The patterns leave nothing to score, or nothing to train on.
+    #[error(
+        "`[score] hold_out` matches {matched} of {of} trajectories; expected it to match some and \
+         leave some to be trained on (a trajectory is called as its file without .csv, with \
+         #episode behind where there is an episode column)"
+    )]
+    HoldOut {
+        /// Trajectories that match.
+        matched: usize,
+        /// All trajectories.
+        of: usize,
+    },
     /// A fold has nothing to be trained on.
     #[error(
         "fold {fold} cannot be scored: the other trajectories do not determine a model; \
@@ -272,6 +284,10 @@ pub fn score<'a, T: Trajectories>(
         let folds = train(source, &plan, lifted, true, progress)?;
         let task = Task { plan: &plan, lifted, options, folds: &folds, arx_lags: None };
         return run(source, task, predictions, progress);
+    }
+    let (of, left) = (counts.trajectories, count(source, &options.hold_out)?.trajectories);
+    if left == 0 || left == of {
+        return Err(ScoreError::HoldOut { matched: of - left, of });
     }
     let arx_lags = best_arx(source, counts, lifted, options, &options.hold_out, progress)?;
     let plan = Plan::HoldOut { patterns: options.hold_out.clone() };

@@ -29,6 +29,8 @@ pub struct Snapshots<'s, 'a, P> {
     structure: &'s Structure<'a>,
     history: History<f64>,
     input: Vec<f64>,
+    values: [f64; MAX_OBSERVABLES],
+    targets: [f64; MAX_OUTPUTS],
     at: PairIndex,
     begun: bool,
     sink: P,
@@ -41,6 +43,8 @@ impl<'s, 'a, P: PairSink> Snapshots<'s, 'a, P> {
             structure,
             history: History::default(),
             input: vec![0.0; structure.inputs().len()],
+            values: [0.0; MAX_OBSERVABLES],
+            targets: [0.0; MAX_OUTPUTS],
             at: PairIndex { trajectory: 0, row: 0 },
             begun: false,
             sink,
@@ -69,12 +73,11 @@ impl<P: PairSink> Visitor for Snapshots<'_, '_, P> {
     fn row(&mut self, states: &[f64], inputs: &[f64]) {
         let sample = self.structure.sample(states);
         if self.history.len() > self.structure.lag() {
-            let mut values = [0.0; MAX_OBSERVABLES];
-            let mut targets = [0.0; MAX_OUTPUTS];
-            self.history.observe(self.structure, &self.input, &mut values);
-            self.history.targets(self.structure, &sample, &mut targets);
-            let observables = self.structure.dictionary().observables().len();
-            self.sink.pair(self.at, &values[..observables], &targets[..self.structure.outputs()]);
+            let values = &mut self.values[..self.structure.dictionary().observables().len()];
+            let targets = &mut self.targets[..self.structure.outputs()];
+            self.history.observe(self.structure, &self.input, values);
+            self.history.targets(self.structure, &sample, targets);
+            self.sink.pair(self.at, values, targets);
         }
         self.history.push(self.structure, &self.input, &sample);
         self.input.copy_from_slice(inputs);
