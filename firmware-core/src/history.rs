@@ -252,6 +252,13 @@ impl Structure<'_> {
     #[inline]
     pub fn sample<S: Scalar>(&self, coordinates: &[S]) -> Sample<S> {
         let mut sample = Sample::ZERO;
+        self.sample_into(coordinates, &mut sample);
+        sample
+    }
+
+    /// [`sample`](Self::sample) over an earlier sample of the same structure.
+    #[inline]
+    pub fn sample_into<S: Scalar>(&self, coordinates: &[S], sample: &mut Sample<S>) {
         let parts = sample.x.iter_mut().zip(&mut sample.sin).zip(&mut sample.cos);
         for (i, (((x, sin), cos), value)) in parts.zip(coordinates).enumerate() {
             *x = *value;
@@ -259,7 +266,6 @@ impl Structure<'_> {
                 (*sin, *cos) = value.sin_cos();
             }
         }
-        sample
     }
 
     #[inline]

@@ -4,6 +4,7 @@
 use std::f64::consts::PI;
 use std::path::Path;
 
+use firmware_core::dictionary::Source;
 use firmware_core::model::{Model, Provenance, Space, Structure};
 use firmware_core::{Predictor, PredictorState, Scalar};
 use proptest::prelude::*;
@@ -17,7 +18,8 @@ use trainer::terms::{Form, Names, distinct_terms, robot_names};
 use trainer::trajectory::{InMemory, Trajectories, Trajectory};
 
 /// Coefficients of order one from noise-free data of order one: the rounding of the data, 1e-16,
-/// times the squared condition number of lifted data (Cholesky), up to 1e4 in these systems.
+/// times the squared condition number of the lifted data (Cholesky), 1e4 at most in these systems,
+/// and room for another hundred.
 const RECOVERED: f64 = 1e-10;
 /// A hundred steps with coefficients that are off by up to [`RECOVERED`], in stable systems.
 const ROLLOUT: f64 = 1e-8;
@@ -28,9 +30,9 @@ const ROLLOUT_F32: f32 = 2e-5;
 const SAME_SOLUTION: f64 = 1e-9;
 /// Sums of a few hundred products in another order, relative to the norms of their two columns.
 const SUMS: f64 = 1e-13;
-/// The same for moments up to harmonic or power 8, from which products of basis functions are
-/// combined with weights up to 100 that partly cancel.
-const MOMENTS: f64 = 1e-10;
+/// The same for moments up to the eighth power, from which products of Hermite polynomials of order
+/// 4 are put together with weights of up to 45 that partly cancel, for four factors at once.
+const MOMENTS: f64 = 1e-11;
 
 const METHODS: [Method; 3] = [Method::Cholesky, Method::Qr, Method::Svd];
 
@@ -48,11 +50,16 @@ impl Noise {
     }
 }
 
+/// The next state from the states and inputs so far, the newest last.
+type Step = fn(&[Vec<f64>], &[Vec<f64>]) -> Vec<f64>;
+
+/// Lifted data, or values of the observables, and the targets; or G and A.
+type Pair = (Vec<f64>, Vec<f64>);
+
 /// A system that is exactly in its dictionary.
 struct System {
     robot: &'static str,
-    /// The next state from the states and inputs so far, the newest last.
-    step: fn(&[Vec<f64>], &[Vec<f64>]) -> Vec<f64>,
+    step: Step,
     /// The terms of every output that are not zero.
     operator: &'static [&'static [(&'static str, f64)]],
 }
@@ -62,7 +69,7 @@ fn back(rows: &[Vec<f64>], lag: usize) -> &[f64] {
     &rows[(rows.len() - 1).saturating_sub(lag)]
 }
 
-const LINEAR_MAP: fn(&[Vec<f64>], &[Vec<f64>]) -> Vec<f64> = |x, u| {
+const LINEAR_MAP: Step = |x, u| {
     let (x, u) = (back(x, 0), back(u, 0));
     vec![0.9 * x[0] + 0.2 * x[1] + 0.1 * u[0], -0.3 * x[0] + 0.8 * x[1] + 0.5 * u[0]]
 };
@@ -251,6 +258,12 @@ fn robot(description: &str) -> Robot {
 /// The robot with the observables in their own units, so that coefficients are the system's.
 fn plain(description: &str) -> Robot {
     Robot { standardise: false, ..robot(description) }
+}
+
+/// The robot's spaces and dictionary, the observables in their own units.
+fn structure(robot: &Robot) -> Structure<'_> {
+    let provenance = Provenance { logs: [0; 32], robot: robot.sha256 };
+    robot.structure(&robot.identity_scaling(), &robot.limits(), provenance).unwrap()
 }
 
 /// Trajectories from random starts, angles all around, under random inputs, the others in [-1, 1).
@@ -483,8 +496,8 @@ fn methods_and_column_scaling_agree_where_nothing_is_exact() {
 }
 
 /// Every pair of a fit, lifted.
-fn lifted_pairs(structure: &Structure<'_>, data: &InMemory<'_>) -> Vec<(Vec<f64>, Vec<f64>)> {
-    struct Sink<'s, 'a>(&'s Structure<'a>, Vec<(Vec<f64>, Vec<f64>)>);
+fn lifted_pairs(structure: &Structure<'_>, data: &InMemory<'_>) -> Vec<Pair> {
+    struct Sink<'s, 'a>(&'s Structure<'a>, Vec<Pair>);
     impl PairSink for Sink<'_, '_> {
         fn pair(&mut self, _: PairIndex, values: &[f64], targets: &[f64]) {
             let dictionary = self.0.dictionary();
@@ -689,7 +702,7 @@ fn second_order_of_both_sine_and_cosine_is_refused() {
 }
 
 /// G and A term by term and pair by pair.
-fn naive(pairs: &[(Vec<f64>, Vec<f64>)]) -> (Vec<f64>, Vec<f64>) {
+fn naive(pairs: &[Pair]) -> Pair {
     let (n, m) = (pairs[0].0.len(), pairs[0].1.len());
     let (mut gram, mut cross) = (vec![0.0; n * n], vec![0.0; n * m]);
     for (lifted, targets) in pairs {
@@ -706,11 +719,7 @@ fn naive(pairs: &[(Vec<f64>, Vec<f64>)]) -> (Vec<f64>, Vec<f64>) {
 }
 
 /// Differences of G and A, each entry relative to the norms of its two columns.
-fn sums_differ(
-    found: &NormalEquations,
-    (gram, cross): &(Vec<f64>, Vec<f64>),
-    target_norms: &[f64],
-) -> f64 {
+fn sums_differ(found: &NormalEquations, (gram, cross): &Pair, target_norms: &[f64]) -> f64 {
     let (n, m) = (found.terms, found.outputs);
     let norm = |i: usize| gram[i * n + i].sqrt().max(f64::MIN_POSITIVE);
     let relative = |a: f64, b: f64, scale: f64| {
@@ -731,11 +740,8 @@ fn sums_differ(
     largest
 }
 
-/// Whatever is observed here stands at lag 0.
-fn accumulate(robot: &Robot, pairs: &[(Vec<f64>, Vec<f64>)]) -> GramAccumulator {
-    let provenance = Provenance { logs: [0; 32], robot: robot.sha256 };
-    let structure =
-        robot.structure(&robot.identity_scaling(), &robot.limits(), provenance).unwrap();
+fn accumulate(robot: &Robot, pairs: &[Pair]) -> GramAccumulator {
+    let structure = structure(robot);
     let mut sums = GramAccumulator::new(structure.dictionary(), pairs[0].1.len());
     for (values, targets) in pairs {
         sums.push(values, targets);
@@ -744,22 +750,26 @@ fn accumulate(robot: &Robot, pairs: &[(Vec<f64>, Vec<f64>)]) -> GramAccumulator 
 }
 
 fn lift(robot: &Robot, values: &[f64]) -> Vec<f64> {
-    let provenance = Provenance { logs: [0; 32], robot: robot.sha256 };
-    let structure =
-        robot.structure(&robot.identity_scaling(), &robot.limits(), provenance).unwrap();
+    let structure = structure(robot);
     let dictionary = structure.dictionary();
     let mut dense = vec![0.0; dictionary.dense_terms()];
     dictionary.lift_dense(values, &mut dense);
     distinct_terms(dictionary).iter().map(|i| dense[*i]).collect()
 }
 
-fn target_norms(pairs: &[(Vec<f64>, Vec<f64>)]) -> Vec<f64> {
+fn target_norms(pairs: &[Pair]) -> Vec<f64> {
     let norm = |j| pairs.iter().map(|(_, z)| z[j] * z[j]).sum::<f64>().sqrt();
     (0..pairs[0].1.len()).map(norm).collect()
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 96, rng_seed: RngSeed::Fixed(9), failure_persistence: None, ..ProptestConfig::default() })]
+    // A fixed seed: a single pair near a zero of a polynomial can be arbitrarily ill-conditioned.
+    #![proptest_config(ProptestConfig {
+        cases: 96,
+        rng_seed: RngSeed::Fixed(9),
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    })]
 
     /// A single block is summed through its distinct moments, where that is cheaper; a second block
     /// that adds nothing (the constant) forces the sums of all products. Both must give what a
@@ -797,16 +807,13 @@ proptest! {
         );
         let (one, two) = (plain(&description("")), plain(&description(", { factors = [] }")));
         let mut noise = Noise(seed);
-        let samples: Vec<(Vec<f64>, Vec<f64>)> = (0..pairs)
+        let samples: Vec<Pair> = (0..pairs)
             .map(|_| {
                 let phi = 4.0 * noise.next();
-                let observe = |(source, _): &(firmware_core::dictionary::Source, u8)| {
-                    use firmware_core::dictionary::Source;
-                    match source {
-                        Source::Sin(_) => phi.sin(),
-                        Source::Cos(_) => phi.cos(),
-                        _ => 2.0 * noise.next(),
-                    }
+                let observe = |(source, _): &(Source, u8)| match source {
+                    Source::Sin(_) => phi.sin(),
+                    Source::Cos(_) => phi.cos(),
+                    _ => 2.0 * noise.next(),
                 };
                 let values = one.observables.iter().map(observe).collect();
                 (values, noise.row(3))
@@ -859,9 +866,7 @@ fn sums_do_not_depend_on_how_pairs_fall_into_trajectories() {
     }
     for description in [LINEAR_KRONECKER.robot, LINEAR_DIRECT_SUM.robot] {
         let robot = plain(description);
-        let provenance = Provenance { logs: [0; 32], robot: robot.sha256 };
-        let structure =
-            robot.structure(&robot.identity_scaling(), &robot.limits(), provenance).unwrap();
+        let structure = structure(&robot);
         let sums = |parts: &[Trajectory]| {
             let sums = Sums(GramAccumulator::new(structure.dictionary(), structure.outputs()));
             let mut snapshots = Snapshots::new(&structure, sums);
@@ -881,5 +886,32 @@ fn sums_do_not_depend_on_how_pairs_fall_into_trajectories() {
             let parts: Vec<Trajectory> = cuts.windows(2).map(part).collect();
             assert_eq!(sums(&parts), expected, "trajectories of {length} pairs");
         }
+    }
+}
+/// A tiny coefficient of a large term: p is in mm, and 1e-10 of its third order moves the state by
+/// as much as u does.
+#[test]
+fn coefficients_are_dropped_by_what_they_contribute() {
+    let robot = plain(
+        r#"
+        states = [{ name = "x", space = "R" }]
+        inputs = [{ name = "u", range = [-1, 1] }, { name = "p", range = [-2000, 2000] }]
+        [dictionary]
+        blocks = [{ factors = ["x"] }, { factors = ["u"] }, { factors = ["p^3"] }]
+    "#,
+    );
+    let step = |x: &[Vec<f64>], u: &[Vec<f64>]| {
+        let p = 2000.0 * back(u, 0)[1];
+        vec![0.5 * back(x, 0)[0] + back(u, 0)[0] + 1e-10 * (p * p * p - 3.0 * p)]
+    };
+    let mut training = trajectories(&robot, step, 20, 50, &mut Noise(9));
+    for row in training.iter_mut().flat_map(|t| t.inputs.chunks_exact_mut(2)) {
+        row[1] *= 2000.0;
+    }
+    for (method, scale_columns) in METHODS.into_iter().flat_map(|m| [(m, true), (m, false)]) {
+        let fit_options = FitOptions { method, scale_columns, ..FitOptions::default() };
+        let robot = Robot { fit: fit_options, ..robot.clone() };
+        let found = fit(&robot, &training).operator.matrix[5];
+        assert!((found / 1e-10 - 1.0).abs() <= RECOVERED, "{method:?}, {scale_columns}: {found}");
     }
 }

@@ -55,10 +55,13 @@ fn record_rosbot(trials: u32, seed: u64, folder: &Path) {
     record::Recording::new(settings).unwrap().write(folder, false).unwrap();
 }
 
+/// States and inputs of one sample.
+type Sample = (Vec<f64>, Vec<f64>);
+
 /// All trajectories of a log with their names.
 #[derive(Default)]
 struct All {
-    trajectories: Vec<(String, Vec<(Vec<f64>, Vec<f64>)>)>,
+    trajectories: Vec<(String, Vec<Sample>)>,
 }
 
 impl All {
@@ -95,7 +98,7 @@ fn blob(robot: &Robot, logs: &Path) -> Box<Aligned<[u8; ROOM]>> {
 /// What the controller predicts from sample `start` on for `horizon` steps.
 fn controller(
     predictor: &Predictor<'_, '_>,
-    rows: &[(Vec<f64>, Vec<f64>)],
+    rows: &[Sample],
     start: usize,
     horizon: usize,
 ) -> Vec<f32> {
@@ -129,7 +132,7 @@ fn a_recorded_robot_is_predicted() {
         for start in (0..rows.len() - 51).step_by(10) {
             // Far from the origin f32 has fewer digits: start where the robot stands.
             let origin = [rows[start].0[0], rows[start].0[1], 0.0];
-            let local: Vec<(Vec<f64>, Vec<f64>)> = rows[start..=start + 50]
+            let local: Vec<Sample> = rows[start..=start + 50]
                 .iter()
                 .map(|(x, u)| (x.iter().zip(origin).map(|(x, o)| x - o).collect(), u.clone()))
                 .collect();

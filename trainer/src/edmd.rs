@@ -81,7 +81,7 @@ pub struct Operator {
     pub pairs: u64,
     /// Numerical rank of the lifted data.
     pub rank: usize,
-    /// Condition number of the lifted data, columns scaled as asked; computed when asked for.
+    /// Factor of the lifted data, columns scaled as asked, without the ridge.
     factor: Vec<f64>,
 }
 
@@ -182,6 +182,7 @@ pub fn solve_normal(
             if options.scale_columns && norm > 0.0 { norm } else { 1.0 }
         })
         .collect();
+    let rms: Vec<f64> = (0..n).map(|i| (equations.gram[i * n + i] * mean).sqrt()).collect();
     let mut gram = vec![0.0; n * n];
     for i in 0..n {
         for j in 0..n {
@@ -194,54 +195,40 @@ pub fn solve_normal(
             x[i * m + j] = equations.cross[i * m + j] * mean / norms[i];
         }
     }
-    // Rank is judged on unit columns, whatever scaling the solution uses.
-    let unit = |gram: &[f64]| {
-        let diagonal: Vec<f64> = (0..n).map(|i| gram[i * n + i].sqrt()).collect();
-        let mut unit = gram.to_vec();
-        for (i, row) in unit.chunks_exact_mut(n).enumerate() {
-            for (j, g) in row.iter_mut().enumerate() {
-                let scale = diagonal[i] * diagonal[j];
-                *g = if scale > 0.0 { *g / scale } else { 0.0 };
-            }
-        }
-        unit
-    };
-    let full = if options.scale_columns {
-        solve::cholesky(&gram, n)
+    let data = factor(&gram, n);
+    let rank = n - data.as_ref().map_or_else(Vec::len, |_| 0);
+    let (l, data) = if options.ridge == 0.0 {
+        let l = data?;
+        (l.clone(), l)
     } else {
-        solve::cholesky(&unit(&gram), n)
-    };
-    let rank = n - full.as_ref().map_or_else(Vec::len, |_| 0);
-    let l = if options.ridge == 0.0 {
-        let l = full?;
-        if options.scale_columns { l } else { factor_unscaled(&l, &gram, n) }
-    } else {
-        let mut ridged = gram.clone();
+        let mut ridged = gram;
         for i in 0..n {
             ridged[i * n + i] += options.ridge;
         }
-        let scale: Vec<f64> = (0..n).map(|i| ridged[i * n + i].sqrt()).collect();
-        let l = solve::cholesky(&unit(&ridged), n)?;
-        unscale(l, &scale, n)
+        (factor(&ridged, n)?, data.unwrap_or_else(|_| vec![0.0; n * n]))
     };
     solve::solve_cholesky(&l, &mut x, n, m);
-    // Transposed: condition() takes the upper factor, though its singular values are the same.
-    Ok(finish(x, &norms, n, m, equations.pairs, rank, l))
+    let matrix = finish(x, (&norms, &rms), (n, m), &l);
+    Ok(Operator { matrix, terms: n, outputs: m, pairs: equations.pairs, rank, factor: data })
 }
 
-/// L of the matrix whose unit-diagonal version has the factor `l`.
-fn factor_unscaled(l: &[f64], gram: &[f64], n: usize) -> Vec<f64> {
+/// The Cholesky factor of a Gram matrix, whose rank is judged on columns of unit norm, whatever
+/// scaling the solution uses.
+fn factor(gram: &[f64], n: usize) -> Result<Vec<f64>, Vec<usize>> {
     let scale: Vec<f64> = (0..n).map(|i| gram[i * n + i].sqrt()).collect();
-    unscale(l.to_vec(), &scale, n)
-}
-
-fn unscale(mut l: Vec<f64>, scale: &[f64], n: usize) -> Vec<f64> {
-    for (row, scale) in l.chunks_exact_mut(n).zip(scale) {
+    let mut unit = gram.to_vec();
+    for (row, a) in unit.chunks_exact_mut(n).zip(&scale) {
+        for (g, b) in row.iter_mut().zip(&scale) {
+            *g = if a * b > 0.0 { *g / (a * b) } else { 0.0 };
+        }
+    }
+    let mut l = solve::cholesky(&unit, n)?;
+    for (row, scale) in l.chunks_exact_mut(n).zip(&scale) {
         for x in row {
             *x *= scale;
         }
     }
-    l
+    Ok(l)
 }
 
 /// F from the R factor of the lifted data and C beside it.
@@ -264,6 +251,7 @@ fn solve_factor(
         }
     }
     let dependent = solve::dependent_columns(&scaled, n);
+    let rms: Vec<f64> = unit.iter().map(|u| u / root).collect();
     let norms: Vec<f64> = unit
         .iter()
         .map(|u| if options.scale_columns && *u > 0.0 { u / root } else { 1.0 })
@@ -279,9 +267,10 @@ fn solve_factor(
     if options.method == Method::Svd {
         let svd = Svd::new(&r, n);
         let (x, rank) = svd.solve(&c, m, options.truncation, options.ridge);
-        return Ok(finish(x, &norms, n, m, pairs, rank, r));
+        let matrix = finish(x, (&norms, &rms), (n, m), &r);
+        return Ok(Operator { matrix, terms: n, outputs: m, pairs, rank, factor: r });
     }
-    let rank = n - dependent.len();
+    let (rank, data) = (n - dependent.len(), r.clone());
     if options.ridge > 0.0 {
         // √λ I below R, zeros below C.
         let mut ridged = RFactor::new(n, m);
@@ -298,20 +287,18 @@ fn solve_factor(
         return Err(dependent);
     }
     solve::solve_upper(&r, n, &mut c, n, m);
-    Ok(finish(c, &norms, n, m, pairs, rank, r))
+    let matrix = finish(c, (&norms, &rms), (n, m), &r);
+    Ok(Operator { matrix, terms: n, outputs: m, pairs, rank, factor: data })
 }
 
-/// Undoes the column scaling and drops what is rounding noise.
+/// Undoes the column scaling and drops what is rounding noise; `factor` is what was solved with.
 fn finish(
     mut x: Vec<f64>,
-    norms: &[f64],
-    n: usize,
-    m: usize,
-    pairs: u64,
-    rank: usize,
-    factor: Vec<f64>,
-) -> Operator {
-    // x is in root-mean-square contributions to the output, so that columns are comparable. The
+    (norms, rms): (&[f64], &[f64]),
+    (n, m): (usize, usize),
+    factor: &[f64],
+) -> Vec<f64> {
+    // Coefficients are compared by their root-mean-square contributions to the output. The
     // error of the solution is about ε κ for QR and ε κ² for Cholesky; the ratio of the factor's
     // diagonal entries bounds κ from below, cheaply and the same on every machine.
     let diagonal = || (0..n).map(|i| factor[i * n + i].abs()).filter(|d| *d > 0.0);
@@ -319,13 +306,18 @@ fn finish(
     let kappa = if low.is_finite() { high / low } else { 1.0 };
     let floor = (8.0 * f64::EPSILON * kappa * kappa).min(ROUNDING_FLOOR);
     for j in 0..m {
-        let largest = (0..n).fold(0.0_f64, |max, i| max.max(x[i * m + j].abs()));
         for i in 0..n {
-            let x = &mut x[i * m + j];
-            *x = if x.abs() <= floor * largest { 0.0 } else { *x / norms[i] };
+            x[i * m + j] /= norms[i];
+        }
+        let contribution = |x: &[f64], i: usize| (x[i * m + j] * rms[i]).abs();
+        let largest = (0..n).fold(0.0_f64, |max, i| max.max(contribution(&x, i)));
+        for i in 0..n {
+            if contribution(&x, i) <= floor * largest {
+                x[i * m + j] = 0.0;
+            }
         }
     }
-    Operator { matrix: x, terms: n, outputs: m, pairs, rank, factor }
+    x
 }
 
 /// No coefficient above this fraction of its column's largest contribution is taken for noise.
@@ -556,11 +548,13 @@ impl Extremes {
     }
 }
 
-/// Mean, standard deviation and extremes of one number (Welford 1962).
+/// Mean, standard deviation and extremes of one number, from sums of its differences to the first
+/// value: no division per sample, and no digits lost when the mean is far from 0.
 #[derive(Clone, Debug)]
 pub(crate) struct Spread {
     count: f64,
-    mean: f64,
+    first: f64,
+    sum: f64,
     squares: f64,
     low: f64,
     high: f64,
@@ -568,24 +562,34 @@ pub(crate) struct Spread {
 
 impl Default for Spread {
     fn default() -> Self {
-        Self { count: 0.0, mean: 0.0, squares: 0.0, low: f64::INFINITY, high: f64::NEG_INFINITY }
+        let (low, high) = (f64::INFINITY, f64::NEG_INFINITY);
+        Self { count: 0.0, first: 0.0, sum: 0.0, squares: 0.0, low, high }
     }
 }
 
 impl Spread {
     #[inline]
     pub(crate) fn push(&mut self, x: f64) {
+        if self.count == 0.0 {
+            self.first = x;
+        }
         self.count += 1.0;
-        let difference = x - self.mean;
-        self.mean += difference / self.count;
-        self.squares += difference * (x - self.mean);
+        let difference = x - self.first;
+        self.sum += difference;
+        self.squares += difference * difference;
         self.low = if x < self.low { x } else { self.low };
         self.high = if x > self.high { x } else { self.high };
     }
 
+    fn mean(&self) -> f64 {
+        self.first + self.sum / self.count.max(1.0)
+    }
+
     /// Population standard deviation.
     pub(crate) fn deviation(&self) -> f64 {
-        if self.count > 0.0 { (self.squares / self.count).sqrt() } else { 0.0 }
+        let count = self.count.max(1.0);
+        let mean = self.sum / count;
+        (self.squares / count - mean * mean).max(0.0).sqrt()
     }
 
     /// Ten times the width of the data to either side: nothing physical, but far from overflow.
@@ -632,8 +636,8 @@ fn standardisation<T: Trajectories>(
                 let deviation = spread.deviation();
                 // A number that never moves is left as it is; the fit will say so.
                 let gain = if deviation > 0.0 { (1.0 / deviation) as f32 } else { 1.0 };
-                let usable = gain.is_finite() && gain != 0.0 && (spread.mean as f32).is_finite();
-                if usable { [spread.mean as f32, gain] } else { [0.0, 1.0] }
+                let usable = gain.is_finite() && gain != 0.0 && (spread.mean() as f32).is_finite();
+                if usable { [spread.mean() as f32, gain] } else { [0.0, 1.0] }
             }
         })
         .collect())

@@ -20,7 +20,9 @@ pub enum ExportError {
     #[error("the controller would refuse the model: {0:?}")]
     Model(ModelError),
     /// The model does not predict its own training data.
-    #[error("the model diverges on its own training data ({0:?}): add a ridge or lower an order")]
+    #[error(
+        "the model diverges at a sample of its own training data: change the ridge or lower an order"
+    )]
     SelfTest(EmitError),
 }
 

@@ -1,7 +1,7 @@
 //! Snapshot pairs: the observables at a sample, and what the operator has to make of them.
 
 use firmware_core::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS};
-use firmware_core::history::History;
+use firmware_core::history::{History, Sample};
 use firmware_core::model::Structure;
 
 use crate::recording::Visitor;
@@ -28,6 +28,7 @@ pub trait PairSink {
 pub struct Snapshots<'s, 'a, P> {
     structure: &'s Structure<'a>,
     history: History<f64>,
+    next: Sample<f64>,
     input: Vec<f64>,
     values: [f64; MAX_OBSERVABLES],
     targets: [f64; MAX_OUTPUTS],
@@ -42,6 +43,7 @@ impl<'s, 'a, P: PairSink> Snapshots<'s, 'a, P> {
         Self {
             structure,
             history: History::default(),
+            next: structure.sample(&[]),
             input: vec![0.0; structure.inputs().len()],
             values: [0.0; MAX_OBSERVABLES],
             targets: [0.0; MAX_OUTPUTS],
@@ -71,16 +73,18 @@ impl<P: PairSink> Visitor for Snapshots<'_, '_, P> {
     }
 
     fn row(&mut self, states: &[f64], inputs: &[f64]) {
-        let sample = self.structure.sample(states);
+        self.structure.sample_into(states, &mut self.next);
         if self.history.len() > self.structure.lag() {
             let values = &mut self.values[..self.structure.dictionary().observables().len()];
             let targets = &mut self.targets[..self.structure.outputs()];
             self.history.observe(self.structure, &self.input, values);
-            self.history.targets(self.structure, &sample, targets);
+            self.history.targets(self.structure, &self.next, targets);
             self.sink.pair(self.at, values, targets);
         }
-        self.history.push(self.structure, &self.input, &sample);
-        self.input.copy_from_slice(inputs);
+        self.history.push(self.structure, &self.input, &self.next);
+        for (to, u) in self.input.iter_mut().zip(inputs) {
+            *to = *u;
+        }
         self.at.row += 1;
     }
 

@@ -205,6 +205,8 @@ impl Svd {
                 us[j * n + i] = r[i * n + j];
             }
         }
+        // Columns that are rounding noise beside the largest ones have no direction to find.
+        let noise = n as f64 * f64::EPSILON * f64::EPSILON * dot(&us, &us);
         // Rotations converge quadratically: a handful of sweeps; the bound is for the pathological.
         for _ in 0..60 {
             let mut rotated = false;
@@ -212,7 +214,9 @@ impl Svd {
                 for q in p + 1..n {
                     let (a, b) = (&us[p * n..][..n], &us[q * n..][..n]);
                     let (alpha, beta, gamma) = (dot(a, a), dot(b, b), dot(a, b));
-                    if gamma.abs() <= f64::EPSILON * (alpha * beta).sqrt() {
+                    if gamma.abs() <= f64::EPSILON * (alpha * beta).sqrt()
+                        || alpha.min(beta) <= noise
+                    {
                         continue;
                     }
                     rotated = true;

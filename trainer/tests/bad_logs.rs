@@ -71,8 +71,8 @@ fn rows() {
     let mut cut = text(&good());
     cut.truncate(cut.rfind(',').unwrap());
     refused(cut, &["row 121, column `u_V`", "4 fields", "found 3"]);
-    refused(&text(&good()[..2]), &["row 2", "one row"]);
-    refused(&text(&good()[..1]), &["no rows"]);
+    refused(text(&good()[..2]), &["row 2", "one row"]);
+    refused(text(&good()[..1]), &["no rows"]);
     refused("", &["empty"]);
     refused("\n\n", &["empty"]);
 }
