@@ -213,11 +213,13 @@ impl Dictionary {
     }
 
     /// The observables, in the order in which their values are laid out.
+    #[inline]
     pub fn observables(&self) -> &[Observable] {
         &self.observables
     }
 
     /// The blocks, each with its factors.
+    #[inline]
     pub fn blocks(&self) -> impl Iterator<Item = (Block, &[Factor])> {
         let mut rest: &[Factor] = &self.factors;
         self.blocks.iter().map(move |block| {
@@ -229,6 +231,7 @@ impl Dictionary {
     }
 
     /// Terms of all blocks one after the other: the number of coefficients per output in a blob.
+    #[inline]
     pub fn dense_terms(&self) -> usize {
         self.dense_terms.into()
     }

@@ -20,13 +20,32 @@ pub struct Sample<S> {
 }
 
 impl<S: Scalar> Sample<S> {
-    const ZERO: Self = Self {
+    pub(crate) const ZERO: Self = Self {
         x: [S::ZERO; MAX_STATES],
         sin: [S::ZERO; MAX_STATES],
         cos: [S::ONE; MAX_STATES],
         increment: [S::ZERO; MAX_STATES],
         input: [S::ZERO; MAX_INPUTS],
     };
+}
+
+impl<S: Scalar> Sample<S> {
+    /// Takes over the coordinates of another sample, one number at a time: they have just been
+    /// written that way, and a wider load would have to wait for the stores.
+    #[inline]
+    fn set(&mut self, other: &Self, states: usize) {
+        let lists = [
+            (&mut self.x, &other.x),
+            (&mut self.sin, &other.sin),
+            (&mut self.cos, &other.cos),
+            (&mut self.increment, &other.increment),
+        ];
+        for (to, from) in lists {
+            for (to, from) in to.iter_mut().zip(from).take(states) {
+                *to = *from;
+            }
+        }
+    }
 }
 
 /// The present sample and the ones before it, as far back as a model may look.
@@ -95,7 +114,7 @@ impl<S: Scalar> History<S> {
             self.samples.copy_within(..kept, 1);
         }
         let [newest, ..] = &mut self.samples;
-        *newest = *next;
+        newest.set(next, structure.states().len());
         // Only what a later step may look at is kept: another model is not shown stale samples.
         let room = u8::try_from(kept).unwrap_or(u8::MAX).saturating_add(1);
         self.filled = self.filled.saturating_add(1).min(room);
@@ -174,8 +193,20 @@ impl<S: Scalar> History<S> {
     /// not finite, an absolute angle has lost its direction, or a coordinate leaves its limit.
     #[inline]
     pub fn retract(&self, structure: &Structure<'_>, outputs: &[S]) -> Option<Sample<S>> {
-        let present = self.newest();
         let mut next = Sample::ZERO;
+        self.retract_into(structure, outputs, &mut next)?;
+        Some(next)
+    }
+
+    /// [`retract`](Self::retract) into a sample that is still [`Sample::ZERO`].
+    #[inline]
+    pub(crate) fn retract_into(
+        &self,
+        structure: &Structure<'_>,
+        outputs: &[S],
+        next: &mut Sample<S>,
+    ) -> Option<()> {
+        let present = self.newest();
         let mut outputs = outputs.iter().copied();
         for (i, state) in structure.states().iter().enumerate() {
             let z = outputs.next()?;
@@ -197,7 +228,8 @@ impl<S: Scalar> History<S> {
                     if !(radius > S::from_f32(1.0 / LONG) && radius < S::from_f32(LONG)) {
                         return None;
                     }
-                    (*sin, *cos) = (z / radius, c / radius);
+                    let shrink = S::ONE / radius;
+                    (*sin, *cos) = (z * shrink, c * shrink);
                 }
             }
         }
@@ -235,11 +267,11 @@ impl<S: Scalar> History<S> {
         if structure.needs_increments() {
             for (i, state) in structure.states().iter().enumerate() {
                 if state.target == Target::Absolute {
-                    *next.increment.get_mut(i)? = structure.change(present, &next, i);
+                    *next.increment.get_mut(i)? = structure.change(present, next, i);
                 }
             }
         }
-        Some(next)
+        Some(())
     }
 }
 

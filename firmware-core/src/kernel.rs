@@ -15,12 +15,13 @@ use heapless::Vec;
 
 use crate::Scalar;
 use crate::capacity::{MAX_BASIS, MAX_BLOCK_FACTORS};
-use crate::dictionary::{Basis, Factor, basis_functions, observable_pair};
+use crate::dictionary::{Basis, Factor, basis_functions, block_size, observable_pair};
 
 /// Coefficients of the last factors, which are folded slowest first.
 const REGISTERS: usize = 16;
-/// Coefficients are folded on the stack in tiles of at most this many.
-const TILE: usize = 256;
+/// Coefficients are folded on the stack in tiles that have at most this many results after the
+/// first axis.
+const ROOM: usize = 64;
 /// Room for the Fourier functions of a block: the radices of a block whose product is at most
 /// [`MAX_TERMS`](crate::capacity::MAX_TERMS) add up to less.
 const FUNCTIONS: usize = 64;
@@ -77,19 +78,68 @@ impl<S: Scalar> Fold<'_, S> {
             (Self::Polynomial { radix: 3, v }, 1) => rows::<S, 3, 1>(*v, from, to),
             (Self::Polynomial { radix: 4, v }, 4) => rows::<S, 4, 4>(*v, from, to),
             (Self::Polynomial { radix: 4, v }, 1) => rows::<S, 4, 1>(*v, from, to),
+            (_, 1) => {
+                let groups = from.chunks_exact(self.radix().max(1));
+                let count = groups.len();
+                for (out, group) in to.iter_mut().zip(groups) {
+                    *out = self.group(group.iter().copied());
+                }
+                count
+            }
             _ => {
                 let stride = stride.max(1);
-                let group = self.radix().saturating_mul(stride).max(1);
-                let mut count = 0_usize;
-                for (to, from) in to.chunks_mut(stride).zip(from.chunks_exact(group)) {
-                    for (offset, out) in to.iter_mut().enumerate() {
-                        *out = self.group(from.iter().skip(offset).step_by(stride).copied());
-                        count = count.saturating_add(1);
-                    }
+                let groups = from.chunks_exact(self.radix().saturating_mul(stride).max(1));
+                let count = groups.len().saturating_mul(stride);
+                for (out, group) in to.chunks_exact_mut(stride).zip(groups) {
+                    self.rows(group.chunks_exact(stride), out);
                 }
                 count
             }
         }
+    }
+
+    /// [`group`](Self::group) for rows of numbers at once.
+    #[inline]
+    fn rows<'r>(&self, rows: impl DoubleEndedIterator<Item = &'r [S]>, out: &mut [S]) {
+        let mut rows = rows.rev();
+        let last = rows.next().unwrap_or(&[]);
+        match self {
+            Self::Polynomial { v, .. } => {
+                for (to, c) in out.iter_mut().zip(last) {
+                    *to = *c;
+                }
+                for row in rows {
+                    for (hi, lo) in out.iter_mut().zip(row) {
+                        *hi = *lo + *v * *hi;
+                    }
+                }
+            }
+            Self::Functions { functions } => {
+                let mut functions = functions.iter().rev();
+                let first = functions.next().copied().unwrap_or_default();
+                for (to, c) in out.iter_mut().zip(last) {
+                    *to = first * *c;
+                }
+                for (row, h) in rows.zip(functions) {
+                    for (sum, c) in out.iter_mut().zip(row) {
+                        *sum = *sum + *h * *c;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Room for the results of a tile after its first and its second axis.
+#[derive(Clone, Debug)]
+pub(crate) struct Scratch<S> {
+    first: [S; ROOM],
+    second: [S; ROOM / 2],
+}
+
+impl<S: Scalar> Scratch<S> {
+    pub(crate) fn new() -> Self {
+        Self { first: [S::ZERO; ROOM], second: [S::ZERO; ROOM / 2] }
     }
 }
 
@@ -126,17 +176,31 @@ pub(crate) fn contract<S: Scalar>(
     coefficients: &[S],
     stride: usize,
     outputs: &mut [S],
+    scratch: &mut Scratch<S>,
 ) {
+    let (mut size, mut last) = (1_usize, 0_usize);
+    for factor in factors.iter().rev() {
+        let larger = size.saturating_mul(factor.radix());
+        if larger > REGISTERS {
+            break;
+        }
+        (size, last) = (larger, last.saturating_add(1));
+    }
+    let (others, last) =
+        factors.split_at_checked(factors.len().saturating_sub(last)).unwrap_or((factors, &[]));
+    let order = || last.iter().chain(others.iter().rev());
+
     // A checked dictionary has no more factors in a block, and no more functions in its factors.
     let mut functions: Vec<S, FUNCTIONS> = Vec::new();
-    for factor in factors.iter().rev().filter(|f| f.basis == Basis::Fourier) {
+    for factor in order().filter(|f| f.basis == Basis::Fourier) {
         let mut basis = [S::ZERO; MAX_BASIS];
         let _ = functions.extend_from_slice(basis_functions(*factor, values, &mut basis));
     }
     let mut functions = functions.as_slice();
     let mut folds: Vec<Axis<'_, S>, MAX_BLOCK_FACTORS> = Vec::new();
-    let (mut size, mut first, mut outer) = (1_usize, 0_usize, 0_usize);
-    for factor in factors.iter().rev() {
+    let tile = order().next().map_or(1, |first| first.radix()).saturating_mul(ROOM);
+    let mut outer = 0_usize;
+    for (i, factor) in order().enumerate() {
         let radix = factor.radix();
         let fold = match factor.basis {
             Basis::Hermite => Fold::Polynomial { radix, v: observable_pair(*factor, values).0 },
@@ -146,60 +210,60 @@ pub(crate) fn contract<S: Scalar>(
                 Fold::Functions { functions: own }
             }
         };
-        let faster = size;
-        size = size.saturating_mul(radix);
-        if size <= REGISTERS {
-            first = first.saturating_add(1);
-            let _ = folds.push((fold, faster));
-        } else {
-            outer = outer.saturating_add(usize::from(size > TILE));
-            let _ = folds.push((fold, 1));
+        let faster = last.get(i.saturating_add(1)..);
+        if i >= last.len() {
+            size = size.saturating_mul(radix);
+            outer = outer.saturating_add(usize::from(size > tile));
         }
-    }
-    if let Some(first) = folds.get_mut(..first) {
-        first.reverse();
+        let _ = folds.push((fold, faster.map_or(1, block_size)));
     }
     let (inner, outer) = folds.split_at(folds.len().saturating_sub(outer));
-    if outer.is_empty() && size == stride {
-        // The only block: the outputs of a tile are one more axis, which is not folded.
-        let together = TILE.checked_div(size).unwrap_or(1).max(1);
-        let rows = coefficients.chunks(together.saturating_mul(size).max(1));
-        for (outputs, rows) in outputs.chunks_mut(together).zip(rows) {
-            contract_tile(inner, rows, outputs);
-        }
+    if size == stride && size.saturating_mul(outputs.len()) <= tile {
+        // The only block, and small: the outputs are one more axis, which is not folded.
+        contract_tile(inner, coefficients, outputs, scratch);
         return;
     }
     for (output, row) in outputs.chunks_mut(1).zip(coefficients.chunks(stride.max(1))) {
         let block = row.get(..size).unwrap_or(&[]);
         if outer.is_empty() {
-            contract_tile(inner, block, output);
+            contract_tile(inner, block, output, scratch);
         } else if let [output] = output {
-            *output = *output + contract_tiles(inner, outer, block);
+            *output = *output + contract_tiles(inner, outer, block, scratch);
         }
     }
 }
 
 /// Folds the outer axes (the last of `outer` is the slowest) over the results of the tiles.
-fn contract_tiles<S: Scalar>(inner: &[Axis<'_, S>], outer: &[Axis<'_, S>], c: &[S]) -> S {
+fn contract_tiles<S: Scalar>(
+    inner: &[Axis<'_, S>],
+    outer: &[Axis<'_, S>],
+    c: &[S],
+    scratch: &mut Scratch<S>,
+) -> S {
     match outer.split_last() {
         None => {
             let mut result = [S::ZERO];
-            contract_tile(inner, c, &mut result);
+            contract_tile(inner, c, &mut result, scratch);
             let [result] = result;
             result
         }
         Some(((slowest, _), faster)) => {
             let size = c.len().checked_div(slowest.radix()).unwrap_or(0).max(1);
-            slowest.group(c.chunks_exact(size).map(|part| contract_tiles(inner, faster, part)))
+            let parts = c.chunks_exact(size);
+            slowest.group(parts.map(|part| contract_tiles(inner, faster, part, scratch)))
         }
     }
 }
 
 /// Folds all axes of a tile in the order of `axes` and adds the results.
 #[inline]
-fn contract_tile<S: Scalar>(axes: &[Axis<'_, S>], c: &[S], outputs: &mut [S]) {
-    let (mut a, mut b) = ([S::ZERO; TILE / 2], [S::ZERO; TILE / 4]);
-    let (mut from, mut to): (&mut [S], &mut [S]) = (&mut a, &mut b);
+fn contract_tile<S: Scalar>(
+    axes: &[Axis<'_, S>],
+    c: &[S],
+    outputs: &mut [S],
+    scratch: &mut Scratch<S>,
+) {
+    let (mut from, mut to): (&mut [S], &mut [S]) = (&mut scratch.first, &mut scratch.second);
     let results = match axes.split_first() {
         None => c,
         Some(((fold, stride), others)) => {

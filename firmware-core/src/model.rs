@@ -299,6 +299,7 @@ fn check_symmetry(symmetry: Symmetry, states: &[State<'_>]) -> Result<(), ModelE
 }
 
 /// Bit `index` of a set of coordinates; there are at most eight.
+#[inline]
 fn bit(index: usize) -> u8 {
     u32::try_from(index).ok().and_then(|i| 1_u8.checked_shl(i)).unwrap_or(0)
 }
@@ -315,21 +316,25 @@ impl<'a> Structure<'a> {
     }
 
     /// State coordinates, in order.
+    #[inline]
     pub fn states(&self) -> &[State<'a>] {
         &self.states
     }
 
     /// Inputs, in order.
+    #[inline]
     pub fn inputs(&self) -> &[Input<'a>] {
         &self.inputs
     }
 
     /// Symmetry.
+    #[inline]
     pub fn symmetry(&self) -> Symmetry {
         self.symmetry
     }
 
     /// The dictionary.
+    #[inline]
     pub fn dictionary(&self) -> &Dictionary {
         &self.dictionary
     }
@@ -340,21 +345,25 @@ impl<'a> Structure<'a> {
     }
 
     /// Columns of the operator: one per coordinate, two for an absolute angle (sine, cosine).
+    #[inline]
     pub fn outputs(&self) -> usize {
         self.outputs.into()
     }
 
     /// The oldest sample that the dictionary looks at, in samples before the present one.
+    #[inline]
     pub fn lag(&self) -> usize {
         self.lag.into()
     }
 
     /// Whether sine and cosine of a coordinate are needed.
+    #[inline]
     pub(crate) fn needs_trigonometry(&self, coordinate: usize) -> bool {
         self.trigonometric & bit(coordinate) != 0
     }
 
     /// Whether lagged increments are observed.
+    #[inline]
     pub(crate) fn needs_increments(&self) -> bool {
         self.increments
     }
@@ -432,16 +441,19 @@ impl<'a, S: Scalar> Model<'a, S> {
     }
 
     /// Everything but the numbers.
+    #[inline]
     pub fn structure(&self) -> &Structure<'a> {
         &self.structure
     }
 
     /// Shape `[outputs, dense_terms]`, outputs slowest.
+    #[inline]
     pub fn coefficients(&self) -> &'a [S] {
         self.coefficients
     }
 
     /// Smallest and largest raw value of every observable in the training data.
+    #[inline]
     pub fn ranges(&self) -> Option<&'a [S]> {
         self.ranges
     }

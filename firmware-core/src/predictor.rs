@@ -5,8 +5,8 @@ use heapless::Vec;
 use crate::Scalar;
 use crate::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES};
 use crate::dictionary::block_size;
-use crate::history::History;
-use crate::kernel::contract;
+use crate::history::{History, Sample};
+use crate::kernel::{Scratch, contract};
 use crate::model::Model;
 
 /// The first time a rollout left the range that the model was trained in.
@@ -204,14 +204,15 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         }
         let mut outputs = [S::ZERO; MAX_OUTPUTS];
         let outputs = outputs.get_mut(..structure.outputs()).unwrap_or_default();
-        let stride = structure.dictionary().dense_terms();
+        let (stride, mut scratch) = (structure.dictionary().dense_terms(), Scratch::new());
         let mut coefficients = self.model.coefficients();
         for (_, factors) in structure.dictionary().blocks() {
-            contract(factors, &values, coefficients, stride, outputs);
+            contract(factors, &values, coefficients, stride, outputs, &mut scratch);
             coefficients = coefficients.get(block_size(factors)..).unwrap_or(&[]);
         }
         let diverged = PredictError::Diverged { step };
-        let next = state.history.retract(structure, outputs).ok_or(diverged)?;
+        let mut next = Sample::ZERO;
+        state.history.retract_into(structure, outputs, &mut next).ok_or(diverged)?;
 
         state.out_of_range = state.out_of_range.or(outside);
         state.history.advance(structure, input, &next);
@@ -287,6 +288,7 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     }
 }
 
+#[inline]
 fn expect_inputs<S: Scalar>(expected: usize, input: &[S]) -> Result<(), PredictError> {
     expect("inputs", expected, input.len())?;
     match input.iter().position(|u| !u.is_finite()) {
@@ -295,6 +297,7 @@ fn expect_inputs<S: Scalar>(expected: usize, input: &[S]) -> Result<(), PredictE
     }
 }
 
+#[inline]
 fn expect(field: &'static str, expected: usize, found: usize) -> Result<(), PredictError> {
     if expected == found {
         Ok(())
