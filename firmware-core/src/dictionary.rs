@@ -343,7 +343,8 @@ impl Dictionary {
 /// Number of terms of a block: the product of the radices of its factors.
 #[inline]
 pub fn block_size(factors: &[Factor]) -> usize {
-    factors.iter().fold(1, |size: usize, factor| size.saturating_mul(factor.radix()))
+    // At most MAX_TERMS in a checked dictionary.
+    factors.iter().fold(1, |size: usize, factor| size.wrapping_mul(factor.radix()))
 }
 
 /// `[H⁰(v), H¹(v), …]`, the probabilists' Hermite polynomials, as far as `out` goes

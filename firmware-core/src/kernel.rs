@@ -13,6 +13,9 @@
 
 use heapless::Vec;
 
+// Sizes of a checked dictionary are small numbers: the wrapping arithmetic below never wraps, and is
+// there because it cannot panic.
+
 use crate::Scalar;
 use crate::capacity::{MAX_BASIS, MAX_BLOCK_FACTORS};
 use crate::dictionary::{Basis, Factor, basis_functions, block_size, observable_pair};
@@ -88,8 +91,8 @@ impl<S: Scalar> Fold<'_, S> {
             }
             _ => {
                 let stride = stride.max(1);
-                let groups = from.chunks_exact(self.radix().saturating_mul(stride).max(1));
-                let count = groups.len().saturating_mul(stride);
+                let groups = from.chunks_exact(self.radix().wrapping_mul(stride).max(1));
+                let count = groups.len().wrapping_mul(stride);
                 for (out, group) in to.chunks_exact_mut(stride).zip(groups) {
                     self.rows(group.chunks_exact(stride), out);
                 }
@@ -162,13 +165,14 @@ fn rows<S: Scalar, const RADIX: usize, const STRIDE: usize>(
         }
         *out = sum;
     }
-    groups.len().saturating_mul(STRIDE)
+    groups.len().wrapping_mul(STRIDE)
 }
 
 /// Adds the contributions of one block to every output.
 ///
 /// `coefficients` has the outputs of a model one after the other, `stride` apart; the block's own
-/// start at the beginning of the slice. `outputs` has shape `[outputs]`.
+/// start at the beginning of the slice. `outputs` has shape `[outputs]`. Returns how many
+/// coefficients the block has per output.
 #[inline]
 pub(crate) fn contract<S: Scalar>(
     factors: &[Factor],
@@ -177,14 +181,14 @@ pub(crate) fn contract<S: Scalar>(
     stride: usize,
     outputs: &mut [S],
     scratch: &mut Scratch<S>,
-) {
+) -> usize {
     let (mut size, mut last) = (1_usize, 0_usize);
     for factor in factors.iter().rev() {
-        let larger = size.saturating_mul(factor.radix());
+        let larger = size.wrapping_mul(factor.radix());
         if larger > REGISTERS {
             break;
         }
-        (size, last) = (larger, last.saturating_add(1));
+        (size, last) = (larger, last.wrapping_add(1));
     }
     let (others, last) =
         factors.split_at_checked(factors.len().saturating_sub(last)).unwrap_or((factors, &[]));
@@ -198,7 +202,7 @@ pub(crate) fn contract<S: Scalar>(
     }
     let mut functions = functions.as_slice();
     let mut folds: Vec<Axis<'_, S>, MAX_BLOCK_FACTORS> = Vec::new();
-    let tile = order().next().map_or(1, |first| first.radix()).saturating_mul(ROOM);
+    let tile = order().next().map_or(1, |first| first.radix()).wrapping_mul(ROOM);
     let mut outer = 0_usize;
     for (i, factor) in order().enumerate() {
         let radix = factor.radix();
@@ -210,18 +214,20 @@ pub(crate) fn contract<S: Scalar>(
                 Fold::Functions { functions: own }
             }
         };
-        let faster = last.get(i.saturating_add(1)..);
-        if i >= last.len() {
-            size = size.saturating_mul(radix);
-            outer = outer.saturating_add(usize::from(size > tile));
+        let mut stride = 1;
+        if let Some(faster) = last.get(i.wrapping_add(1)..) {
+            stride = block_size(faster);
+        } else {
+            size = size.wrapping_mul(radix);
+            outer = outer.wrapping_add(usize::from(size > tile));
         }
-        let _ = folds.push((fold, faster.map_or(1, block_size)));
+        let _ = folds.push((fold, stride));
     }
     let (inner, outer) = folds.split_at(folds.len().saturating_sub(outer));
-    if size == stride && size.saturating_mul(outputs.len()) <= tile {
+    if size == stride && size.wrapping_mul(outputs.len()) <= tile {
         // The only block, and small: the outputs are one more axis, which is not folded.
         contract_tile(inner, coefficients, outputs, scratch);
-        return;
+        return size;
     }
     for (output, row) in outputs.chunks_mut(1).zip(coefficients.chunks(stride.max(1))) {
         let block = row.get(..size).unwrap_or(&[]);
@@ -231,6 +237,7 @@ pub(crate) fn contract<S: Scalar>(
             *output = *output + contract_tiles(inner, outer, block, scratch);
         }
     }
+    size
 }
 
 /// Folds the outer axes (the last of `outer` is the slowest) over the results of the tiles.

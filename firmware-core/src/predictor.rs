@@ -4,7 +4,6 @@ use heapless::Vec;
 
 use crate::Scalar;
 use crate::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES};
-use crate::dictionary::block_size;
 use crate::history::{History, Sample};
 use crate::kernel::{Scratch, contract};
 use crate::model::Model;
@@ -207,8 +206,8 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         let (stride, mut scratch) = (structure.dictionary().dense_terms(), Scratch::new());
         let mut coefficients = self.model.coefficients();
         for (_, factors) in structure.dictionary().blocks() {
-            contract(factors, &values, coefficients, stride, outputs, &mut scratch);
-            coefficients = coefficients.get(block_size(factors)..).unwrap_or(&[]);
+            let used = contract(factors, &values, coefficients, stride, outputs, &mut scratch);
+            coefficients = coefficients.get(used..).unwrap_or(&[]);
         }
         let diverged = PredictError::Diverged { step };
         let mut next = Sample::ZERO;

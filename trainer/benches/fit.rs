@@ -6,8 +6,10 @@ use std::path::Path;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use trainer::edmd;
+use trainer::export::{export, write_whole};
+use trainer::recording::Recording;
 use trainer::robot::Robot;
-use trainer::trajectory::{InMemory, Trajectory};
+use trainer::trajectory::{InMemory, Logs, Trajectory};
 
 const ROBOT: &str = r#"
 name = "rosbot"
@@ -81,5 +83,39 @@ fn fit(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, fit);
+/// 50,000 rows of CSV in one file to a blob on disk, without the scoring.
+fn from_csv(c: &mut Criterion) {
+    let robot = Robot::parse(ROBOT, Path::new("robot.toml")).expect("the description is valid");
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut text = String::from("time_s,x_m,y_m,phi_rad,omega_r_radps,omega_l_radps\n");
+    for trajectory in drive(1, 49_999) {
+        let rows = trajectory.states.chunks_exact(3).zip(trajectory.inputs.chunks_exact(2));
+        for (k, (x, u)) in rows.enumerate() {
+            let time = k as f64 / 10.0;
+            text += &format!("{time},{},{},{},{},{}\n", x[0], x[1], x[2], u[0], u[1]);
+        }
+    }
+    let log = folder.path().join("log.csv");
+    std::fs::write(&log, &text).expect("a file");
+    let mut group = c.benchmark_group(format!("50000 rows of CSV, {} bytes", text.len()));
+    group.sample_size(20);
+    group.bench_function("read, fit and write the blob", |b| {
+        b.iter(|| {
+            let recording = Recording::open(&log).expect("the log is there");
+            let source = Logs { recording: &recording, schema: &robot.schema };
+            let fitted = edmd::fit(&robot, &source, &|_| ()).expect("the log is good");
+            let bytes = export(&fitted).expect("the model is good");
+            write_whole(&folder.path().join("model.bin"), |f| f.write_all(&bytes)).expect("room");
+        });
+    });
+    group.bench_function("read and split the lines alone", |b| {
+        b.iter(|| {
+            let bytes = std::fs::read(&log).expect("the log is there");
+            black_box(bytes.split(|byte| [b',', b'\n'].contains(byte)).count())
+        });
+    });
+    group.finish();
+}
+
+criterion_group!(benches, fit, from_csv);
 criterion_main!(benches);

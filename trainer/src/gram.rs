@@ -6,8 +6,9 @@
 //! instead of 2,080 for six factors of order 1. They are summed as one small matrix product
 //! (moments of the first factors × moments of the last factors) and spread over G at the end.
 //!
-//! The order of all sums is fixed and every operation is a separately rounded multiplication or
-//! addition, so that vector units of any width give the same bits.
+//! The order of all sums is fixed and every operation, the fused multiply-add among them, is exactly
+//! rounded, so that vector units of any width give the same bits. (A machine without fused
+//! multiply-add emulates it: slow, and the same.)
 
 use firmware_core::capacity::MAX_BASIS;
 use firmware_core::dictionary::{Basis, Dictionary, Factor, fourier};
