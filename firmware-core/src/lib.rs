@@ -2,6 +2,28 @@
 //!
 //! `no_std`, no allocation, no panic, no unbounded loop. The trainer on the laptop uses this very
 //! code in `f64`, so that there is one lift and one prediction.
+//!
+//! ```
+//! use firmware_core::blob::Aligned;
+//! use firmware_core::{Predictor, PredictorState};
+//!
+//! static BLOB: &Aligned<[u8]> =
+//!     &Aligned(*include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/rosbot/model.bin")));
+//!
+//! let model = firmware_core::parse_for("rosbot", &BLOB.0).unwrap();
+//! let predictor = Predictor::new(&model);
+//! let mut state = PredictorState::new();
+//! // Measured: x, y [m], heading [rad]. Before the first sample nothing was applied.
+//! predictor.observe(&mut state, &[], &[1.0, 2.0, 0.5]).unwrap();
+//!
+//! // Where will it be in one second, ten samples, with wheel speeds of 12 and 7 rad/s held?
+//! let mut path = [0.0_f32; 30];
+//! predictor.rollout_held(&mut state.clone(), &[12.0, 7.0], &mut path).unwrap();
+//! let [.., x, y, phi] = path;
+//! // A wheel radius of 0.062 m and a track of 0.228 m give an arc of 0.589 m that turns by 1.360 rad.
+//! assert!((x - 1.208).abs() < 0.01 && (y - 2.507).abs() < 0.01 && (phi - 1.860).abs() < 0.01);
+//! assert_eq!(state.out_of_range(), None);
+//! ```
 #![doc = ""]
 //! | module | what lives there |
 //! |---|---|

@@ -397,7 +397,6 @@ impl<'p> Rows<'p> {
         for (i, x) in states.iter().enumerate() {
             let continuous = match self.present.get(i) {
                 Some(before) if self.circles[i] => before + (x - before).wrap(),
-                None if self.circles[i] => x.wrap(),
                 _ => *x,
             };
             next.push(continuous);
