@@ -192,36 +192,39 @@ pub(crate) fn contract<S: Scalar>(
     }
     let (others, last) =
         factors.split_at_checked(factors.len().saturating_sub(last)).unwrap_or((factors, &[]));
-    let order = || last.iter().chain(others.iter().rev());
 
     // A checked dictionary has no more factors in a block, and no more functions in its factors.
     let mut functions: Vec<S, FUNCTIONS> = Vec::new();
-    for factor in order().filter(|f| f.basis == Basis::Fourier) {
-        let mut basis = [S::ZERO; MAX_BASIS];
-        let _ = functions.extend_from_slice(basis_functions(*factor, values, &mut basis));
+    if factors.iter().any(|f| f.basis == Basis::Fourier) {
+        for factor in last.iter().chain(others.iter().rev()).filter(|f| f.basis == Basis::Fourier) {
+            let mut basis = [S::ZERO; MAX_BASIS];
+            let _ = functions.extend_from_slice(basis_functions(*factor, values, &mut basis));
+        }
     }
     let mut functions = functions.as_slice();
-    let mut folds: Vec<Axis<'_, S>, MAX_BLOCK_FACTORS> = Vec::new();
-    let tile = order().next().map_or(1, |first| first.radix()).wrapping_mul(ROOM);
-    let mut outer = 0_usize;
-    for (i, factor) in order().enumerate() {
-        let radix = factor.radix();
-        let fold = match factor.basis {
-            Basis::Hermite => Fold::Polynomial { radix, v: observable_pair(*factor, values).0 },
-            Basis::Fourier => {
-                let (own, others) = functions.split_at_checked(radix).unwrap_or((functions, &[]));
-                functions = others;
-                Fold::Functions { functions: own }
-            }
-        };
-        let mut stride = 1;
-        if let Some(faster) = last.get(i.wrapping_add(1)..) {
-            stride = block_size(faster);
-        } else {
-            size = size.wrapping_mul(radix);
-            outer = outer.wrapping_add(usize::from(size > tile));
+    let mut fold = |factor: &Factor, radix: usize| match factor.basis {
+        Basis::Hermite => Fold::Polynomial { radix, v: observable_pair(*factor, values).0 },
+        Basis::Fourier => {
+            let (own, others) = functions.split_at_checked(radix).unwrap_or((functions, &[]));
+            functions = others;
+            Fold::Functions { functions: own }
         }
-        let _ = folds.push((fold, stride));
+    };
+    let mut folds: Vec<Axis<'_, S>, MAX_BLOCK_FACTORS> = Vec::new();
+    let mut rest = last;
+    while let [factor, faster @ ..] = rest {
+        let _ = folds.push((fold(factor, factor.radix()), block_size(faster)));
+        rest = faster;
+    }
+    let (mut tile, mut outer) = (folds.first().map_or(0, |(fold, _)| fold.radix() * ROOM), 0_usize);
+    for factor in others.iter().rev() {
+        let radix = factor.radix();
+        if tile == 0 {
+            tile = radix.wrapping_mul(ROOM);
+        }
+        size = size.wrapping_mul(radix);
+        outer = outer.wrapping_add(usize::from(size > tile));
+        let _ = folds.push((fold(factor, radix), 1));
     }
     let (inner, outer) = folds.split_at(folds.len().saturating_sub(outer));
     if size == stride && size.wrapping_mul(outputs.len()) <= tile {
