@@ -253,6 +253,12 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
     };
     let logs = args.logs.clone().unwrap_or_else(|| folder.join("logs"));
     let out = args.out.clone().unwrap_or_else(|| folder.join("model.bin"));
+    if out.extension().is_some_and(|e| e == "toml" || e == "csv") {
+        let out = out.display();
+        return Err(Failure(format!(
+            "{out}: a blob must not take the place of a description or a log; give --out FILE.bin"
+        )));
+    }
     let recording = Recording::open(&logs)?;
     let source = Logs { recording: &recording, schema: &robot.schema };
 
@@ -505,6 +511,15 @@ fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     let (schema, options) = log_schema(args, &model)?;
     let recording = Recording::open(&args.logs)?;
     let source = Logs { recording: &recording, schema: &schema };
+    if let Some(path) = &args.csv
+        && args.logs.is_dir()
+        && recording.files().iter().any(|log| log.parent() == path.parent())
+    {
+        return Err(Failure(format!(
+            "{}: beside the logs, the predictions would be read as a log; give --csv another folder",
+            path.display()
+        )));
+    }
     let training = args.train.as_deref().map(Recording::open).transpose()?;
     let scoring = bar("scoring", recording.bytes());
     let progress = |bytes| scoring.set_position(bytes);

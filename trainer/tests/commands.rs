@@ -531,3 +531,17 @@ fn mistakes_on_the_command_line() {
         assert!(help.contains(&format!("Usage: trainer {command}")), "{help}");
     }
 }
+
+#[test]
+fn outputs_take_no_place_of_inputs() {
+    let workshop = Workshop::new();
+    workshop.succeed(&["fit", ".", "--no-score"]);
+    let description = workshop.read("robot.toml");
+    let message = workshop.refuse(&["fit", ".", "--out", "robot.toml"]);
+    assert!(message.contains("robot.toml: a blob must not"), "{message}");
+    assert_eq!(workshop.read("robot.toml"), description);
+    let inside = ["evaluate", "model.bin", "--logs", "logs", "--csv", "logs/predicted.csv"];
+    let message = workshop.refuse(&inside);
+    assert!(message.contains("logs/predicted.csv: beside the logs"), "{message}");
+    workshop.succeed(&["fit", ".", "--no-score"]);
+}
