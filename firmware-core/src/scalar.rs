@@ -75,16 +75,12 @@ pub trait Scalar:
 
     /// The same number; `f32` to `f64` is exact.
     fn from_f32(value: f32) -> Self;
-    /// A small integer.
-    fn from_u8(value: u8) -> Self;
     /// `(sin, cos)` of an angle in radians.
     fn sin_cos(self) -> (Self, Self);
     /// The angle of the point `(x, self)`, in (−π, π].
     fn atan2(self, x: Self) -> Self;
     /// Square root, correctly rounded.
     fn sqrt(self) -> Self;
-    /// The smallest integer that is not less.
-    fn ceil(self) -> Self;
     /// What the division towards zero leaves over, exact, with the sign of `self`.
     fn rem(self, divisor: Self) -> Self;
     /// Absolute value.
@@ -120,7 +116,7 @@ pub trait Scalar:
 }
 
 macro_rules! scalar {
-    ($float:ident, $sincos:ident, $atan2:ident, $sqrt:ident, $ceil:ident, $fmod:ident, $fabs:ident) => {
+    ($float:ident, $sincos:ident, $atan2:ident, $sqrt:ident, $fmod:ident, $fabs:ident) => {
         impl Number for $float {
             const ZERO: Self = 0.0;
             const ONE: Self = 1.0;
@@ -135,10 +131,6 @@ macro_rules! scalar {
                 value.into()
             }
             #[inline]
-            fn from_u8(value: u8) -> Self {
-                value.into()
-            }
-            #[inline]
             fn sin_cos(self) -> (Self, Self) {
                 libm::$sincos(self)
             }
@@ -149,10 +141,6 @@ macro_rules! scalar {
             #[inline]
             fn sqrt(self) -> Self {
                 libm::$sqrt(self)
-            }
-            #[inline]
-            fn ceil(self) -> Self {
-                libm::$ceil(self)
             }
             #[inline]
             fn rem(self, divisor: Self) -> Self {
@@ -170,5 +158,5 @@ macro_rules! scalar {
     };
 }
 
-scalar!(f32, sincosf, atan2f, sqrtf, ceilf, fmodf, fabsf);
-scalar!(f64, sincos, atan2, sqrt, ceil, fmod, fabs);
+scalar!(f32, sincosf, atan2f, sqrtf, fmodf, fabsf);
+scalar!(f64, sincos, atan2, sqrt, fmod, fabs);

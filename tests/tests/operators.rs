@@ -13,7 +13,7 @@ use trainer::edmd::{self, Fit, FitError};
 use trainer::export::{export, monomial_coefficients};
 use trainer::gram::{GramAccumulator, NormalEquations};
 use trainer::robot::{FitOptions, Method, Robot};
-use trainer::snapshots::{PairIndex, PairSink, Snapshots};
+use trainer::snapshots::{PairSink, Snapshots};
 use trainer::terms::{Form, Names, distinct_terms, robot_names};
 use trainer::trajectory::{InMemory, Trajectories, Trajectory};
 
@@ -499,7 +499,7 @@ fn methods_and_column_scaling_agree_where_nothing_is_exact() {
 fn lifted_pairs(structure: &Structure<'_>, data: &InMemory<'_>) -> Vec<Pair> {
     struct Sink<'s, 'a>(&'s Structure<'a>, Vec<Pair>);
     impl PairSink for Sink<'_, '_> {
-        fn pair(&mut self, _: PairIndex, values: &[f64], targets: &[f64]) {
+        fn pair(&mut self, _: u64, values: &[f64], targets: &[f64]) {
             let dictionary = self.0.dictionary();
             let mut dense = vec![0.0; dictionary.dense_terms()];
             dictionary.lift_dense(values, &mut dense);
@@ -860,7 +860,7 @@ fn every_number_of_pairs_is_summed_whole() {
 fn sums_do_not_depend_on_how_pairs_fall_into_trajectories() {
     struct Sums(GramAccumulator);
     impl PairSink for Sums {
-        fn pair(&mut self, _: PairIndex, values: &[f64], targets: &[f64]) {
+        fn pair(&mut self, _: u64, values: &[f64], targets: &[f64]) {
             self.0.push(values, targets);
         }
     }

@@ -18,7 +18,7 @@ use firmware_sim::{Integrator, Plant};
 use trainer::edmd::{self, Regression};
 use trainer::gram::{GramAccumulator, NormalEquations};
 use trainer::robot::{FitOptions, Method, Robot};
-use trainer::snapshots::{PairIndex, PairSink, Snapshots};
+use trainer::snapshots::{PairSink, Snapshots};
 use trainer::solve::Svd;
 use trainer::trajectory::{InMemory, Trajectories, Trajectory};
 
@@ -191,7 +191,7 @@ fn pooled(folder: &Path, name: &str, inputs: &str) {
 fn normal_equations(robot: &Robot, data: &InMemory<'_>) -> NormalEquations {
     struct Sums(GramAccumulator);
     impl PairSink for Sums {
-        fn pair(&mut self, _: PairIndex, values: &[f64], targets: &[f64]) {
+        fn pair(&mut self, _: u64, values: &[f64], targets: &[f64]) {
             self.0.push(values, targets);
         }
     }

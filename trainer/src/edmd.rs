@@ -2,14 +2,13 @@
 //! snapshot pairs of all trajectories (Williams, Kevrekidis & Rowley 2015; Shi & Karydis 2021,
 //! equations 2 and 3, with F = K B solved for directly).
 
-use firmware_core::capacity::MAX_OBSERVABLES;
 use firmware_core::dictionary::{Dictionary, Source};
 use firmware_core::model::{ModelError, Provenance, Space, Structure};
 
 use crate::gram::{GramAccumulator, NormalEquations};
 use crate::recording::{Summary, Visitor};
 use crate::robot::{FitOptions, Method, Robot, Scaling};
-use crate::snapshots::{PairIndex, PairSink, Snapshots};
+use crate::snapshots::{PairSink, Snapshots};
 use crate::solve::{self, RFactor, Svd};
 use crate::terms::distinct_terms;
 use crate::trajectory::Trajectories;
@@ -176,13 +175,8 @@ pub fn solve_normal(
 ) -> Result<Operator, Vec<usize>> {
     let (n, m) = (equations.terms, equations.outputs);
     let mean = 1.0 / equations.pairs.max(1) as f64;
-    let norms: Vec<f64> = (0..n)
-        .map(|i| {
-            let norm = (equations.gram[i * n + i] * mean).sqrt();
-            if options.scale_columns && norm > 0.0 { norm } else { 1.0 }
-        })
-        .collect();
     let rms: Vec<f64> = (0..n).map(|i| (equations.gram[i * n + i] * mean).sqrt()).collect();
+    let norms = column_scales(&rms, options);
     let mut gram = vec![0.0; n * n];
     for i in 0..n {
         for j in 0..n {
@@ -210,6 +204,11 @@ pub fn solve_normal(
     solve::solve_cholesky(&l, &mut x, n, m);
     let matrix = finish(x, (&norms, &rms), (n, m), &l);
     Ok(Operator { matrix, terms: n, outputs: m, pairs: equations.pairs, rank, factor: data })
+}
+
+/// What the columns are divided by: their root mean square, or nothing.
+fn column_scales(rms: &[f64], options: &FitOptions) -> Vec<f64> {
+    rms.iter().map(|rms| if options.scale_columns && *rms > 0.0 { *rms } else { 1.0 }).collect()
 }
 
 /// The Cholesky factor of a Gram matrix, whose rank is judged on columns of unit norm, whatever
@@ -252,10 +251,7 @@ fn solve_factor(
     }
     let dependent = solve::dependent_columns(&scaled, n);
     let rms: Vec<f64> = unit.iter().map(|u| u / root).collect();
-    let norms: Vec<f64> = unit
-        .iter()
-        .map(|u| if options.scale_columns && *u > 0.0 { u / root } else { 1.0 })
-        .collect();
+    let norms = column_scales(&rms, options);
     for row in r.chunks_exact_mut(n) {
         for (x, norm) in row.iter_mut().zip(&norms) {
             *x /= norm * root;
@@ -425,7 +421,7 @@ struct FitSink<'p> {
 
 impl PairSink for FitSink<'_> {
     #[inline]
-    fn pair(&mut self, _: PairIndex, values: &[f64], targets: &[f64]) {
+    fn pair(&mut self, _: u64, values: &[f64], targets: &[f64]) {
         self.extremes.push(values);
         self.regression.push(values, targets);
     }
@@ -611,7 +607,7 @@ fn standardisation<T: Trajectories>(
         progress: &'p dyn Fn(u64),
     }
     impl PairSink for Sink<'_> {
-        fn pair(&mut self, _: PairIndex, values: &[f64], _: &[f64]) {
+        fn pair(&mut self, _: u64, values: &[f64], _: &[f64]) {
             for (spread, v) in self.spreads.iter_mut().zip(values) {
                 spread.push(*v);
             }
@@ -624,7 +620,7 @@ fn standardisation<T: Trajectories>(
     let provenance = Provenance { logs: [0; 32], robot: robot.sha256 };
     let structure =
         robot.structure(&identity, &robot.limits(), provenance).map_err(FitError::Model)?;
-    let spreads = vec![Spread::default(); identity.len().min(MAX_OBSERVABLES)];
+    let spreads = vec![Spread::default(); identity.len()];
     let mut snapshots = Snapshots::new(&structure, Sink { spreads, progress });
     trajectories.visit(&mut snapshots).map_err(FitError::Trajectories)?;
     let spreads = snapshots.into_sink().spreads;

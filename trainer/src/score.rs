@@ -17,7 +17,7 @@ use crate::edmd::{Operator, Regression, Spread};
 use crate::export::{controller_coefficients, coordinate};
 use crate::recording::Visitor;
 use crate::robot::{FitOptions, ScoreOptions};
-use crate::snapshots::{PairIndex, PairSink, Snapshots};
+use crate::snapshots::{PairSink, Snapshots};
 use crate::trajectory::Trajectories;
 
 /// What trajectories serve for.
@@ -425,10 +425,10 @@ fn train<'a, T: Trajectories>(
         regressions: Vec<Option<Regression>>,
     }
     impl PairSink for Sink<'_> {
-        fn pair(&mut self, at: PairIndex, values: &[f64], targets: &[f64]) {
+        fn pair(&mut self, row: u64, values: &[f64], targets: &[f64]) {
             for (fold, regression) in self.regressions.iter_mut().enumerate() {
                 if let Some(regression) = regression
-                    && self.plan.trains(fold, self.role, at.row)
+                    && self.plan.trains(fold, self.role, row)
                 {
                     regression.push(values, targets);
                 }

@@ -6,19 +6,11 @@ use firmware_core::model::Structure;
 
 use crate::recording::Visitor;
 
-/// Where a snapshot pair comes from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PairIndex {
-    /// Number of the trajectory, from 0.
-    pub trajectory: usize,
-    /// Row of the later sample in its trajectory, from 0.
-    pub row: u64,
-}
-
 /// Takes snapshot pairs.
 pub trait PairSink {
-    /// `values`, shape `[observables]`, as the dictionary takes them; `targets`, shape `[outputs]`.
-    fn pair(&mut self, at: PairIndex, values: &[f64], targets: &[f64]);
+    /// `values`, shape `[observables]`, as the dictionary takes them; `targets`, shape `[outputs]`;
+    /// `row` is that of the later sample in its trajectory, from 0.
+    fn pair(&mut self, row: u64, values: &[f64], targets: &[f64]);
     /// Bytes of the log read so far.
     fn progress(&mut self, _bytes: u64) {}
 }
@@ -32,8 +24,7 @@ pub struct Snapshots<'s, 'a, P> {
     input: Vec<f64>,
     values: [f64; MAX_OBSERVABLES],
     targets: [f64; MAX_OUTPUTS],
-    at: PairIndex,
-    begun: bool,
+    row: u64,
     sink: P,
 }
 
@@ -47,8 +38,7 @@ impl<'s, 'a, P: PairSink> Snapshots<'s, 'a, P> {
             input: vec![0.0; structure.inputs().len()],
             values: [0.0; MAX_OBSERVABLES],
             targets: [0.0; MAX_OUTPUTS],
-            at: PairIndex { trajectory: 0, row: 0 },
-            begun: false,
+            row: 0,
             sink,
         }
     }
@@ -67,9 +57,7 @@ impl<'s, 'a, P: PairSink> Snapshots<'s, 'a, P> {
 impl<P: PairSink> Visitor for Snapshots<'_, '_, P> {
     fn begin(&mut self, _name: &str) {
         self.history.clear();
-        self.at.trajectory += usize::from(self.begun);
-        self.at.row = 0;
-        self.begun = true;
+        self.row = 0;
     }
 
     fn row(&mut self, states: &[f64], inputs: &[f64]) {
@@ -79,13 +67,13 @@ impl<P: PairSink> Visitor for Snapshots<'_, '_, P> {
             let targets = &mut self.targets[..self.structure.outputs()];
             self.history.observe(self.structure, &self.input, values);
             self.history.targets(self.structure, &self.next, targets);
-            self.sink.pair(self.at, values, targets);
+            self.sink.pair(self.row, values, targets);
         }
         self.history.push(self.structure, &self.input, &self.next);
         for (to, u) in self.input.iter_mut().zip(inputs) {
             *to = *u;
         }
-        self.at.row += 1;
+        self.row += 1;
     }
 
     fn progress(&mut self, bytes: u64) {
