@@ -9,9 +9,11 @@
 //! | [`plant`] | the trait [`Plant`]: outputs and inputs with units, reset, step, observe |
 //! | [`integrate`] | [`Integrator`]: exact, RK4 or Euler, and the two methods themselves |
 //! | [`drive`] | differential drive (ROSbot), the paper's system (drive) |
+//! | [`rosbot`] | skid-steered ROSbot with motors, encoders and slip, an invented but plausible plant |
 //! | [`arm`] | two-revolute-joint arm, the paper's system (arm) |
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
 //! | [`record`] | logs as CSV, one file per trajectory |
+//! | [`paper`] | the logs that repeat the paper's experiments |
 //!
 //! "The paper" is L. Shi and K. Karydis, "ACD-EDMD: Analytical Construction for Dictionaries of
 //! Lifting Functions in Koopman Operator-Based Nonlinear Robotic Systems", IEEE Robotics and
@@ -42,9 +44,12 @@ pub mod arm;
 pub mod drive;
 mod excitation;
 pub mod integrate;
+mod log;
 mod normal;
+pub mod paper;
 pub mod plant;
 pub mod record;
+pub mod rosbot;
 mod sinc;
 pub mod soft_leg;
 

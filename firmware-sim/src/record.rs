@@ -43,18 +43,15 @@
 
 use crate::arm::{Arm, ArmParameters};
 use crate::drive::{Drive, DriveParameters};
-use crate::excitation::{Excitation, Signal, round_to};
+use crate::excitation::{Excitation, Signal};
 use crate::integrate::{Integrator, Numerical};
-use crate::normal::standard_normal;
+use crate::log::{NOISE_STREAM, Sensor, file_name, is_file_name, rows, stream, write_csv};
 use crate::plant::Plant;
 use crate::soft_leg::{SoftLeg, SoftLegParameters};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
-use std::ffi::OsStr;
 use std::fmt;
-use std::fmt::Write as _;
 use std::fs;
 use std::io;
+use std::iter;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use tempfile::TempPath;
@@ -200,8 +197,6 @@ pub enum SettingsError {
 const MOST_SAMPLES: u32 = 100_000_000;
 /// Decimal digits that every f64 keeps.
 const MOST_DIGITS: u8 = 15;
-/// Where the noise streams begin, beyond every trial's own number.
-const NOISE_STREAM: u64 = 1 << 63;
 
 fn integrators(robot: Robot) -> &'static str {
     match robot {
@@ -312,18 +307,15 @@ impl Recording {
         match self.plant.clone() {
             AnyPlant::Drive(drive) => {
                 let signal = Signal::Gaussian { std: 9.0, limit: 32.0 };
-                let sensor = Sensor { std: [1e-3, 1e-3, 2e-3], decimals: 6 };
-                self.write_rows(trial, drive, Excitation::new(signal, 3), sensor, out)
+                self.write_rows(trial, drive, Excitation::new(signal, 3), Sensor::POSE, out)
             }
             AnyPlant::Arm(arm) => {
                 let signal = Signal::Gaussian { std: 1.0, limit: f64::INFINITY };
-                let sensor = Sensor { std: [2e-4, 2e-4, 5e-3, 5e-3], decimals: 6 };
-                self.write_rows(trial, arm, Excitation::new(signal, 4), sensor, out)
+                self.write_rows(trial, arm, Excitation::new(signal, 4), Sensor::JOINTS, out)
             }
             AnyPlant::SoftLeg(leg) => {
                 let signal = Signal::Steps { limit: 12.0, zero_share: 0.2, hold: 4..=20 };
-                let sensor = Sensor { std: [0.1, 0.1], decimals: 4 };
-                self.write_rows(trial, leg, Excitation::new(signal, 2), sensor, out)
+                self.write_rows(trial, leg, Excitation::new(signal, 2), Sensor::TIP, out)
             }
         }
     }
@@ -331,52 +323,23 @@ impl Recording {
     fn write_rows<const OUTPUTS: usize, const INPUTS: usize>(
         &self,
         trial: u32,
-        mut plant: impl Plant<OUTPUTS, INPUTS>,
+        plant: impl Plant<OUTPUTS, INPUTS> + Clone,
         mut excitation: Excitation<INPUTS>,
-        sensor: Sensor<OUTPUTS>,
+        usual: Sensor<OUTPUTS>,
         out: impl io::Write,
     ) -> io::Result<()> {
-        let Settings { seed, noise, digits, .. } = self.settings;
-        let stream = |number| {
-            let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            rng.set_stream(number);
-            rng
+        let Settings { robot, seed, noise, digits, .. } = self.settings;
+        let mut input_rng = stream(seed, u64::from(trial));
+        let noise_rng = stream(seed, NOISE_STREAM + u64::from(trial));
+        let sensor = Sensor {
+            std: usual.std.map(|std| noise * std),
+            decimals: digits.or(usual.decimals.filter(|_| noise > 0.0)),
         };
-        let mut input_rng = stream(u64::from(trial));
-        let mut noise_rng = stream(u64::from(trial) + NOISE_STREAM);
-        let decimals = digits.or((noise > 0.0).then_some(sensor.decimals));
-        let rate_hz = f64::from(self.settings.robot.rate_hz());
-
-        let mut csv = csv::Writer::from_writer(out);
-        let columns = plant.outputs().map(|column| column.to_string());
-        let commands = plant.inputs().map(|column| column.to_string());
-        csv.write_record(
-            ["time_s"].into_iter().chain(columns.iter().chain(&commands).map(String::as_str)),
-        )?;
-        let mut field = String::new();
-        for row in 0..self.rows() {
-            let measured = {
-                let mut outputs = plant.observe();
-                for (output, std) in outputs.iter_mut().zip(sensor.std) {
-                    if noise > 0.0 {
-                        *output += noise * std * standard_normal(&mut noise_rng);
-                    }
-                    *output = decimals.map_or(*output, |decimals| round_to(*output, decimals));
-                }
-                outputs
-            };
-            let input = excitation.next(&mut input_rng);
-            let time_s = f64::from(row) / rate_hz;
-            for number in [time_s].iter().chain(&measured).chain(&input) {
-                field.clear();
-                // The shortest decimal that reads back as the same f64; a String takes any text.
-                let _ = write!(field, "{number}");
-                csv.write_field(&field)?;
-            }
-            csv.write_record(None::<&[u8]>)?;
-            plant.step(&input, 1.0 / rate_hz);
-        }
-        csv.flush()
+        let inputs =
+            iter::repeat_with(|| excitation.next(&mut input_rng)).take(self.rows() as usize);
+        let rate_hz = robot.rate_hz();
+        let rows = rows(plant.clone(), rate_hz, inputs, sensor, noise_rng);
+        write_csv(out, &plant, rate_hz, rows)
     }
 
     /// Records every trial into `dir`, which is made if need be.
@@ -437,14 +400,6 @@ impl fmt::Display for Recording {
     }
 }
 
-/// Noise and resolution of the measured outputs.
-struct Sensor<const OUTPUTS: usize> {
-    /// Standard deviations at noise scale 1, in the outputs' units.
-    std: [f64; OUTPUTS],
-    /// Decimals that are written with noise.
-    decimals: u8,
-}
-
 /// Why a recording was not written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -477,18 +432,6 @@ pub enum WriteError {
         /// What the system said.
         source: io::Error,
     },
-}
-
-fn file_name(trial: u32) -> String {
-    format!("trial-{trial:03}.csv")
-}
-
-/// Whether [`file_name`] gives this name for some trial.
-fn is_file_name(name: &OsStr) -> bool {
-    name.to_str()
-        .and_then(|name| name.strip_prefix("trial-")?.strip_suffix(".csv"))
-        .and_then(|digits| digits.parse().ok())
-        .is_some_and(|trial| name == file_name(trial).as_str())
 }
 
 /// The files of an earlier recording in `dir`, if they may be overwritten.
