@@ -2,6 +2,7 @@
 //! y⁺ = c + Σᵢ (Aᵢ yₖ₋ᵢ + Bᵢ uₖ₋ᵢ), i = 0 … L, by least squares on standardised columns with a ridge
 //! of 1e-6 on the normalised Gram matrix (not on the constant). Angles are continuous.
 
+use crate::forecast::{Data, Forecast};
 use crate::solve;
 
 /// Lags tried.
@@ -199,5 +200,96 @@ impl Arx {
                 *y += w * x;
             }
         }
+    }
+}
+
+/// The ARX as a [`Forecast`]: the models with 0, 1, … lags, of which the one with as many lags as
+/// there are earlier samples predicts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ArxForecast {
+    models: Vec<Arx>,
+}
+
+impl ArxForecast {
+    /// Fits the models with up to [`MAX_LAGS`] lags; `None` without data.
+    pub fn fit(training: Data<'_>) -> Option<Self> {
+        let (n, m) = (training.spaces.len(), training.inputs);
+        let mut sums = ArxAccumulator::new(n, m);
+        for trajectory in training.trajectories {
+            let rows: Vec<Vec<f64>> = rows(&trajectory.states, &trajectory.inputs, n).collect();
+            for (k, row) in rows.iter().enumerate() {
+                sums.row(row);
+                if k > 0 {
+                    sums.pair(rows[..k].iter().rev().map(Vec::as_slice), &row[..n]);
+                }
+            }
+        }
+        let models = (0..=MAX_LAGS).map(|lags| sums.fit(lags)).collect::<Option<_>>()?;
+        Some(Self { models })
+    }
+
+    /// The same with no more than `lags` lags.
+    pub fn with_lags(&self, lags: usize) -> Self {
+        Self { models: self.models[..(lags + 1).min(self.models.len())].to_vec() }
+    }
+}
+
+/// States and inputs of each sample side by side.
+fn rows<'t>(states: &'t [f64], inputs: &'t [f64], n: usize) -> impl Iterator<Item = Vec<f64>> + 't {
+    let samples = states.len() / n.max(1);
+    let m = inputs.len() / samples.max(1);
+    (0..samples).map(move |k| [&states[k * n..][..n], &inputs[k * m..][..m]].concat())
+}
+
+impl Forecast for ArxForecast {
+    fn predict(&self, states: &[f64], inputs: &[f64], next: &mut [f64]) -> bool {
+        let n = next.len();
+        let samples = states.len() / n.max(1);
+        let Some(model) = self.models[..samples.min(self.models.len())].last() else {
+            return false;
+        };
+        let m = inputs.len() / samples;
+        let used = samples - 1 - model.lags;
+        let recent: Vec<Vec<f64>> = rows(&states[used * n..], &inputs[used * m..], n).collect();
+        model.predict(recent.iter().rev().map(Vec::as_slice), next);
+        next.iter().all(|x| x.is_finite())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::trajectory::Trajectory;
+    use firmware_core::model::Space;
+
+    /// x⁺ = 1.5 x − 0.7 x₋₁ + u₋₁: needs one lag.
+    fn oscillator() -> Trajectory {
+        let mut t = Trajectory { states: vec![1.0, 0.5], inputs: Vec::new() };
+        t.inputs = (0..400).map(|k| f64::from(k * k % 17) / 17.0 - 0.4).collect();
+        for k in 1..399 {
+            let next = 1.5 * t.states[k] - 0.7 * t.states[k - 1] + t.inputs[k - 1];
+            t.states.push(next);
+        }
+        t
+    }
+
+    #[test]
+    fn a_forecast_uses_as_many_lags_as_there_are_samples() {
+        let walk = [oscillator()];
+        let data =
+            Data { spaces: &[Space::Line], inputs: 1, sample_time_s: 1.0, trajectories: &walk };
+        let arx = ArxForecast::fit(data).unwrap();
+        let mut next = [0.0];
+        let mut error = |arx: &ArxForecast, samples: usize| {
+            assert!(arx.predict(&walk[0].states[..samples], &walk[0].inputs[..samples], &mut next));
+            (next[0] - walk[0].states[samples]).abs()
+        };
+        // From the second sample on the lag is there; the ridge leaves a trace.
+        let mut worst =
+            |arx: &ArxForecast| (2..60).map(|k| error(arx, k)).fold(0.0_f64, |a, e| a.max(e));
+        assert!(worst(&arx) < 1e-4);
+        assert!(worst(&arx.with_lags(0)) > 0.1, "no lag, no oscillation");
+        assert!(error(&arx, 1) > 1e-2, "nothing to look back at");
+        assert!(ArxForecast::fit(Data { trajectories: &[], ..data }).is_none());
     }
 }

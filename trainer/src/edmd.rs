@@ -395,21 +395,30 @@ pub(crate) fn solve_named<E>(
     structure: &Structure<'_>,
     regression: Regression,
 ) -> Result<Operator, FitError<E>> {
-    let operator = regression.solve(&robot.fit, structure.outputs()).map_err(|dependent| {
-        let dictionary = structure.dictionary();
-        let distinct = distinct_terms(dictionary);
-        let (states, inputs) = crate::terms::robot_names(robot);
-        let names = crate::terms::Names { states: &states, inputs: &inputs };
-        let name = |i: &usize| names.term(dictionary, distinct[*i], crate::terms::Form::Hermite);
-        FitError::RankDeficient {
-            terms: distinct.len(),
-            dependent: dependent.iter().map(name).collect(),
-        }
-    })?;
+    let operator = regression
+        .solve(&robot.fit, structure.outputs())
+        .map_err(|dependent| rank_deficient(robot, structure, &dependent))?;
     if operator.matrix.iter().all(|x| x.is_finite()) {
         Ok(operator)
     } else {
         Err(FitError::NotFinite)
+    }
+}
+
+/// Names dependent terms, given as indices of distinct terms, by the robot's words.
+pub(crate) fn rank_deficient<E>(
+    robot: &Robot,
+    structure: &Structure<'_>,
+    dependent: &[usize],
+) -> FitError<E> {
+    let dictionary = structure.dictionary();
+    let distinct = distinct_terms(dictionary);
+    let (states, inputs) = crate::terms::robot_names(robot);
+    let names = crate::terms::Names { states: &states, inputs: &inputs };
+    let name = |i: &usize| names.term(dictionary, distinct[*i], crate::terms::Form::Hermite);
+    FitError::RankDeficient {
+        terms: distinct.len(),
+        dependent: dependent.iter().map(name).collect(),
     }
 }
 
@@ -597,7 +606,7 @@ impl Spread {
 }
 
 /// Mean and standard deviation of every observable on ℝ, as centre and gain.
-fn standardisation<T: Trajectories>(
+pub(crate) fn standardisation<T: Trajectories>(
     robot: &Robot,
     trajectories: &T,
     progress: &dyn Fn(u64),

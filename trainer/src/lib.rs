@@ -8,23 +8,37 @@
 //! | [`gram`], [`solve`], [`edmd`] | the least-squares problem in constant memory |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
 //! | [`score`], [`arx`] | rollouts over windows beside no motion and a linear ARX |
-//! | [`report`], [`inspect`], [`spectrum`], [`terms`] | what the commands print |
+//! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
+//! | [`forecast`], [`koopman`], [`hermite`], [`edmd_dl`], [`sindy`] | one interface for every method, the methods |
+//! | [`reproduce`], [`convergence`], [`figures`], [`plot`] | the paper's experiments, tables and figures |
+//! | [`report`], [`inspect`], [`spectrum_report`], [`terms`] | what the commands print |
 //! | [`topology`] | lifting functions of a topology, as in the paper's table |
 //! | [`resample`] | logs on a regular time grid |
 
 pub mod arx;
+pub mod convergence;
 pub mod edmd;
+pub mod edmd_dl;
 pub mod export;
+pub mod figures;
+pub mod forecast;
+pub mod full_operator;
 pub mod gram;
+pub mod hermite;
 pub mod inspect;
+pub mod koopman;
+pub mod plot;
 pub mod recording;
 pub mod report;
+pub mod reproduce;
 pub mod resample;
 pub mod robot;
 pub mod score;
+pub mod sindy;
 pub mod snapshots;
 pub mod solve;
 pub mod spectrum;
+pub mod spectrum_report;
 pub mod terms;
 pub mod topology;
 pub mod trajectory;

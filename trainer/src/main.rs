@@ -12,12 +12,16 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use trainer::edmd;
 use trainer::export::{export, write_whole};
+use trainer::figures;
+use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
 use trainer::recording::{LogColumn, LogSchema, Recording};
 use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
+use trainer::reproduce::{self, Method as PaperMethod};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
 use trainer::robot::{Method, Robot, ScoreOptions};
 use trainer::score::{self, Counts, Lifted};
+use trainer::spectrum_report::SpectrumReport;
 use trainer::topology::{Orders, lifting};
 use trainer::trajectory::Logs;
 
@@ -34,8 +38,10 @@ enum Command {
     Fit(FitArgs),
     Evaluate(EvaluateArgs),
     Inspect(InspectArgs),
+    Spectrum(SpectrumArgs),
     Dictionary(DictionaryArgs),
     Resample(ResampleArgs),
+    Reproduce(ReproduceArgs),
 }
 
 /// Fit the model of a robot to its logs, score it on held-out trajectories, and write the blob.
@@ -99,6 +105,22 @@ struct InspectArgs {
     json: bool,
 }
 
+/// Show the Koopman eigenvalues of a robot's operator while its inputs are held, with their modes.
+#[derive(Args)]
+struct SpectrumArgs {
+    /// The robot's folder, or its robot.toml.
+    robot: PathBuf,
+    /// Folder of CSV logs, or one CSV file [default: logs/ beside robot.toml].
+    #[arg(long, value_name = "DIR")]
+    logs: Option<PathBuf>,
+    /// The inputs that are held, in their order and units, separated by commas [default: all 0].
+    #[arg(long, value_name = "U1,U2,...", value_delimiter = ',', allow_hyphen_values = true)]
+    input: Vec<String>,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
 /// Show the lifting functions of a topology, as in the ACD-EDMD paper's table.
 #[derive(Args)]
 struct DictionaryArgs {
@@ -154,6 +176,24 @@ struct ResampleArgs {
     max_gap: Option<f64>,
 }
 
+/// Run the experiments of the ACD-EDMD paper with every method, and print its tables beside ours.
+///
+/// Also writes the report (report.md) and the paper's figures drawn from these results (SVG).
+#[derive(Args)]
+struct ReproduceArgs {
+    /// Logs written by `firmware-sim record paper --out DIR`.
+    dir: PathBuf,
+    /// Folder for the report and the figures.
+    #[arg(long, value_name = "DIR", default_value = "paper-report")]
+    out: PathBuf,
+    /// Leave out EDMD-DL, which takes most of the time.
+    #[arg(long)]
+    quick: bool,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
 /// A message for the user.
 struct Failure(String);
 
@@ -168,8 +208,10 @@ fn main() -> ExitCode {
         Command::Fit(args) => fit(&args),
         Command::Evaluate(args) => evaluate(&args),
         Command::Inspect(args) => show_blob(&args),
+        Command::Spectrum(args) => spectrum(&args),
         Command::Dictionary(args) => dictionary(&args),
         Command::Resample(args) => resample_logs(&args),
+        Command::Reproduce(args) => reproduce_paper(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -244,13 +286,18 @@ struct OperatorReport {
     condition: f64,
 }
 
+/// Where a robot's files are, given its folder or its robot.toml.
+fn folder(robot: &Path) -> PathBuf {
+    if robot.is_dir() {
+        robot.to_owned()
+    } else {
+        robot.parent().map(Path::to_owned).unwrap_or_default()
+    }
+}
+
 fn fit(args: &FitArgs) -> Result<(), Failure> {
     let robot = Robot::load(&args.robot)?;
-    let folder = if args.robot.is_dir() {
-        args.robot.clone()
-    } else {
-        args.robot.parent().map(Path::to_owned).unwrap_or_default()
-    };
+    let folder = folder(&args.robot);
     let logs = args.logs.clone().unwrap_or_else(|| folder.join("logs"));
     let out = args.out.clone().unwrap_or_else(|| folder.join("model.bin"));
     if out.extension().is_some_and(|e| e == "toml" || e == "csv") {
@@ -609,6 +656,48 @@ fn show_blob(args: &InspectArgs) -> Result<(), Failure> {
     print(&inspection.text(args.all))
 }
 
+/// `spectrum --json`.
+#[derive(Serialize)]
+struct SpectrumJson<'r> {
+    format: u32,
+    command: &'static str,
+    #[serde(flatten)]
+    report: &'r SpectrumReport,
+}
+
+fn spectrum(args: &SpectrumArgs) -> Result<(), Failure> {
+    let robot = Robot::load(&args.robot)?;
+    let given = args.input.join(",");
+    let number = |text: &String| {
+        let value = text.trim().parse().ok().filter(|value: &f64| value.is_finite());
+        value.ok_or_else(|| Failure(format!("--input {given}: `{text}` is not a finite number")))
+    };
+    let mut input = args.input.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
+    if input.is_empty() {
+        input.resize(robot.inputs.len(), 0.0);
+    } else if input.len() != robot.inputs.len() {
+        let names: Vec<&str> = robot.inputs.iter().map(|u| u.name.as_str()).collect();
+        return Err(Failure(format!(
+            "--input {given}: expected {} values, found {}; the inputs of {} are: {}",
+            names.len(),
+            input.len(),
+            robot.name,
+            names.join(", ")
+        )));
+    }
+    let recording =
+        Recording::open(&args.logs.clone().unwrap_or_else(|| folder(&args.robot).join("logs")))?;
+    let source = Logs { recording: &recording, schema: &robot.schema };
+    let reading = bar("fitting", recording.bytes());
+    let full = FullOperator::fit(&robot, &source, &|bytes| reading.set_position(bytes));
+    reading.finish_and_clear();
+    let report = SpectrumReport::new(&full?, robot.schema.sample_time_s, &input)?;
+    if args.json {
+        return print_json(&SpectrumJson { format: 1, command: "spectrum", report: &report });
+    }
+    print(&report.text())
+}
+
 /// `dictionary --json`.
 #[derive(Serialize)]
 struct DictionaryReport<'r> {
@@ -731,4 +820,40 @@ fn columns_by_name(
     schema.time.clone_from(&args.time);
     schema.episode.clone_from(&args.episode);
     Ok((schema, angles))
+}
+
+fn reproduce_paper(args: &ReproduceArgs) -> Result<(), Failure> {
+    let out = &args.out;
+    if out.exists() && !out.is_dir() {
+        return Err(Failure(format!("{}: not a folder; give another --out", out.display())));
+    }
+    let mut methods = PaperMethod::ALL.to_vec();
+    methods.retain(|m| !(args.quick && *m == PaperMethod::EdmdDl));
+    let bar = ProgressBar::new(1);
+    if let Ok(style) = ProgressStyle::with_template("{wide_bar} {pos}/{len} {elapsed} {msg:40}") {
+        bar.set_style(style);
+    }
+    bar.enable_steady_tick(std::time::Duration::from_millis(200));
+    let results = reproduce::run(&args.dir, &methods, &|done, total, next| {
+        bar.set_length(total as u64);
+        bar.set_position(done as u64);
+        bar.set_message(next.to_owned());
+    });
+    bar.finish_and_clear();
+    let results = results?;
+    std::fs::create_dir_all(out).map_err(|e| format!("{}: cannot be made: {e}", out.display()))?;
+    let mut report = results.text();
+    let mut links = String::from("\n## Figures\n\n");
+    for (name, svg) in figures::all(&results) {
+        write_whole(&out.join(name), |file| file.write_all(svg.as_bytes()))?;
+        links += &format!("![{name}]({name})\n");
+    }
+    report += &format!("\n{}", results.times());
+    let file = out.join("report.md");
+    let whole = format!("{report}{links}");
+    write_whole(&file, |file| file.write_all(whole.as_bytes()))?;
+    if args.json {
+        return print_json(&results);
+    }
+    print(&format!("{report}\nReport and figures: {}\n", file.display()))
 }

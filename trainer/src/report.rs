@@ -239,7 +239,7 @@ pub fn significant(x: f64) -> String {
     } else if !(1e-4..1e6).contains(&magnitude) {
         format!("{x:.3e}")
     } else {
-        let decimals = (3 - magnitude.log10().floor() as i32).max(0) as usize;
+        let decimals = (3 - libm::floor(libm::log10(magnitude)) as i32).max(0) as usize;
         format!("{x:.decimals$}")
     }
 }

@@ -68,3 +68,25 @@ impl Trajectories for InMemory<'_> {
         Ok(summary)
     }
 }
+
+/// All trajectories of a source, in memory.
+///
+/// # Errors
+/// The source's own.
+pub fn collect<T: Trajectories>(source: &T) -> Result<Vec<Trajectory>, T::Error> {
+    struct Collector(Vec<Trajectory>);
+    impl Visitor for Collector {
+        fn begin(&mut self, _: &str) {
+            self.0.push(Trajectory::default());
+        }
+        fn row(&mut self, states: &[f64], inputs: &[f64]) {
+            if let Some(last) = self.0.last_mut() {
+                last.states.extend_from_slice(states);
+                last.inputs.extend_from_slice(inputs);
+            }
+        }
+    }
+    let mut collector = Collector(Vec::new());
+    source.visit(&mut collector)?;
+    Ok(collector.0)
+}

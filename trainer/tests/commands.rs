@@ -526,7 +526,8 @@ fn mistakes_on_the_command_line() {
         assert_eq!((said.code, said.stdout.as_str()), (Some(2), ""), "{arguments:?}");
         assert!(said.stderr.contains("--help") || said.stderr.contains("Usage"), "{}", said.stderr);
     }
-    for command in ["fit", "evaluate", "inspect", "dictionary", "resample"] {
+    for command in ["fit", "evaluate", "inspect", "spectrum", "dictionary", "resample", "reproduce"]
+    {
         let help = workshop.succeed(&[command, "--help"]);
         assert!(help.contains(&format!("Usage: trainer {command}")), "{help}");
     }
@@ -544,4 +545,17 @@ fn outputs_take_no_place_of_inputs() {
     let message = workshop.refuse(&inside);
     assert!(message.contains("logs/predicted.csv: beside the logs"), "{message}");
     workshop.succeed(&["fit", ".", "--no-score"]);
+}
+
+#[test]
+fn reproduce_wants_the_papers_logs() {
+    let workshop = Workshop::new();
+    let message = workshop.refuse(&["reproduce", "logs", "--out", "report"]);
+    assert!(message.contains("paper.toml: cannot be read"), "{message}");
+    assert!(message.contains("`firmware-sim record paper --out DIR`"), "{message}");
+    workshop.write("paper.toml", "seed = 1\nlogs = 3\n");
+    let message = workshop.refuse(&["reproduce", ".", "--out", "report"]);
+    assert!(message.contains("paper.toml: invalid type"), "{message}");
+    let message = workshop.refuse(&["reproduce", ".", "--out", "robot.toml"]);
+    assert!(message.contains("robot.toml: not a folder"), "{message}");
 }
