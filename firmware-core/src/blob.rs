@@ -23,18 +23,36 @@
 //! | kind | section | encoding | status |
 //! |---|---|---|---|
 //! | 0x0001 | metadata: [`ModelRepr`] | 1: postcard 1 | required |
-//! | 0x0002 | coefficients `[outputs, dense_terms]` | 2: f32, dense, powers of the observables | required |
+//! | 0x0002 | coefficients `[outputs, dense_terms]`, of a sparse model `[outputs, T + 1]` | 2: f32, powers of the observables | required |
 //! | 0x0003 | self-test, below | 3: f32 | required |
-//! | 0x0004 | term indices of sparse coefficients | | reserved |
+//! | 0x0004 | terms of a sparse model, below: `[T, 2]` | 4: u8 | makes the model sparse |
 //! | 0x0005 | coefficients in Q31 | | reserved |
 //! | 0x8001 | trained ranges `[observables, 2]`: smallest, largest raw value | 3: f32 | optional |
-//! | 0x8002 | error bounds | | reserved |
+//! | 0x8002 | error bounds, below | 5: u32 and f32 | optional |
 //! | 0x8003 | signature | | reserved |
 //!
 //! The self-test is one prediction: with L the largest lag, the states at samples k − L … k, shape
 //! `[L + 1, states]`; the inputs at the same samples, shape `[L + 1, inputs]`; the expected
 //! coordinates at k + 1 and the tolerance of each, shape `[states]` both. The model is refused
 //! unless it predicts within the tolerance, a finite one (angles compared on the circle).
+//!
+//! A blob without terms is a dense model: every term of every block of the metadata has its
+//! coefficients. In one with terms ([`sparse`](crate::sparse)) every block is a single factor, not
+//! cut, and only provides functions: v, v², …, vᵖ or sin φ, cos φ, …, sin pφ, cos pφ, numbered from 0
+//! over all factors in order. Entry k = 1 … T of the terms is a parent p < k and a function g:
+//! term k is term p times function g, and term 0 the constant 1, which has the first coefficient of
+//! every output. T is at most 255.
+//!
+//! | offset in the error bounds | size | field |
+//! |---|---|---|
+//! | 0 | 4 | coverage, f32, between 0 and 1, both excluded |
+//! | 4 | 4 | calibration units, u32, at least 1 |
+//! | 8 | 4 | number of horizons H, u32, at least 1 |
+//! | 12 | 4 H | horizons \[steps\], u32, ascending from 1 or more to at most 65,535 |
+//! | 12 + 4 H | 4 H n | bounds `[H, states]`, f32, finite, from 0 on, in the unit of the coordinate |
+//!
+//! With the probability of the coverage a measured coordinate is within its bound of the predicted
+//! one ([`ErrorBounds`]).
 //!
 //! Metadata in postcard, field by field: integers of one byte as they are, lengths as varints,
 //! enumerations as a varint of the variant in the order of the declaration, `f32` as four bytes,
@@ -44,6 +62,7 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 
 use crate::Scalar;
 use crate::capacity::MAX_STATES;
+use crate::error_bounds::{ErrorBounds, ErrorBoundsError};
 use crate::model::{Model, ModelError, ModelRepr, Space, Structure};
 use crate::predictor::{PredictError, Predictor, PredictorState};
 
@@ -61,7 +80,9 @@ const OPTIONAL: u16 = 0x8000;
 const METADATA: (u16, u16) = (0x0001, 1);
 const COEFFICIENTS: (u16, u16) = (0x0002, 2);
 const SELF_TEST: (u16, u16) = (0x0003, 3);
+const TERMS: (u16, u16) = (0x0004, 4);
 const RANGES: (u16, u16) = (0x8001, 3);
+const ERROR_BOUNDS: (u16, u16) = (0x8002, 5);
 
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
@@ -124,16 +145,20 @@ pub enum ParseError {
         /// Its kind.
         kind: u16,
     },
-    /// The metadata cannot be decoded; larger dimensions than the [capacities](crate::capacity) are
-    /// among the reasons.
+    /// The metadata cannot be decoded.
     Metadata,
+    /// The metadata have a longer list than this build has [room](crate::capacity) for, or name a
+    /// variant that it does not know.
+    Unsupported,
     /// The parts do not make a model.
     Model(ModelError),
-    /// A section does not have the length that the metadata asks for.
+    /// The error bounds are none.
+    ErrorBounds(ErrorBoundsError),
+    /// A section does not have the length that the metadata, or its own first numbers, ask for.
     SectionLength {
         /// Its kind.
         kind: u16,
-        /// Length in bytes that the metadata asks for.
+        /// Length in bytes that is asked for.
         expected: usize,
         /// Length found.
         found: usize,
@@ -235,7 +260,7 @@ impl<'a> SelfTest<'a> {
 /// # Errors
 /// [`ParseError`] names the first thing that is wrong.
 pub fn parse(bytes: &[u8]) -> Result<Model<'_>, ParseError> {
-    let expected = total_length(bytes)?;
+    let expected = length(bytes)?;
     if bytes.len() > expected {
         return Err(ParseError::Trailing { expected, found: bytes.len() });
     }
@@ -251,7 +276,8 @@ pub fn parse_for<'a>(robot: &str, bytes: &'a [u8]) -> Result<Model<'a>, ParseErr
     if model.structure().robot() == robot { Ok(model) } else { Err(ParseError::AnotherRobot) }
 }
 
-/// Reads the blob at the beginning of a flash slot, whatever follows it.
+/// Reads the blob at the beginning of a flash slot, whatever follows it; [`length`] says where it
+/// ends.
 ///
 /// # Errors
 /// As [`parse`].
@@ -259,9 +285,9 @@ pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
     if !slot.as_ptr().addr().is_multiple_of(4) {
         return Err(ParseError::Misaligned);
     }
-    let length = total_length(slot)?;
-    let truncated = ParseError::Truncated { expected: length, found: slot.len() };
-    let blob = slot.get(..length).ok_or(truncated)?;
+    let total = length(slot)?;
+    let truncated = ParseError::Truncated { expected: total, found: slot.len() };
+    let blob = slot.get(..total).ok_or(truncated)?;
     let (expected, found) = (read_u32(blob, 12), checksum(blob));
     if expected != found {
         return Err(ParseError::Checksum { expected, found });
@@ -270,25 +296,34 @@ pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
 
     let metadata = sections.bytes(METADATA)?;
     let (repr, rest) =
-        postcard::take_from_bytes::<ModelRepr<'_>>(metadata).map_err(|_| ParseError::Metadata)?;
+        postcard::take_from_bytes::<ModelRepr<'_>>(metadata).map_err(|error| match error {
+            // What serde and heapless refuse although the bytes are postcard.
+            postcard::Error::SerdeDeCustom => ParseError::Unsupported,
+            _ => ParseError::Metadata,
+        })?;
     if !rest.is_empty() {
         return Err(ParseError::Metadata);
     }
     let structure = Structure::try_from(repr).map_err(ParseError::Model)?;
     let coefficients = sections.numbers(COEFFICIENTS)?;
-    let ranges = match sections.numbers(RANGES) {
-        Err(ParseError::MissingSection { .. }) => None,
-        other => Some(other?),
-    };
-    let model = Model::new(structure, coefficients, ranges).map_err(ParseError::Model)?;
+    let ranges = present(sections.numbers(RANGES))?;
+    let mut model = match present(sections.terms())? {
+        None => Model::new(structure, coefficients, ranges),
+        Some(terms) => Model::new_sparse(structure, terms, coefficients, ranges),
+    }
+    .map_err(ParseError::Model)?;
+    if let Some(words) = present(sections.words(ERROR_BOUNDS))? {
+        let bounds = error_bounds(model.structure().states().len(), words)?;
+        model = model.with_error_bounds(bounds).map_err(ParseError::Model)?;
+    }
 
     let numbers = sections.numbers(SELF_TEST)?;
-    let length = ParseError::SectionLength {
+    let wrong = ParseError::SectionLength {
         kind: SELF_TEST.0,
         expected: SelfTest::len(model.structure()).saturating_mul(4),
         found: numbers.len().saturating_mul(4),
     };
-    let self_test = SelfTest::split(model.structure(), numbers).ok_or(length)?;
+    let self_test = SelfTest::split(model.structure(), numbers).ok_or(wrong)?;
     match self_test.failure(&model) {
         None => Ok(model),
         Some(coordinate) => Err(ParseError::SelfTest { coordinate }),
@@ -306,8 +341,23 @@ pub fn self_test(bytes: &[u8]) -> Result<SelfTest<'_>, ParseError> {
         .ok_or(ParseError::MissingSection { kind: SELF_TEST.0 })
 }
 
-/// Magic, version and total length of the header.
-fn total_length(bytes: &[u8]) -> Result<usize, ParseError> {
+/// The total length in bytes of the blob at the beginning of a flash slot, as its header says: what
+/// follows is no part of it. Only the header is looked at; whether it is a blob [`parse_prefix`]
+/// decides.
+///
+/// # Errors
+/// [`ParseError::Truncated`] if the slot is shorter than the header or the length,
+/// [`ParseError::Magic`], [`ParseError::Version`], and [`ParseError::SectionTable`] for a length that
+/// no blob has.
+///
+/// ```
+/// use firmware_core::blob;
+/// let blob = include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/rosbot/model.bin"));
+/// let mut slot = [0xFF; 16_384];
+/// slot[..blob.len()].copy_from_slice(blob);
+/// assert_eq!(blob::length(&slot), Ok(blob.len()));
+/// ```
+pub fn length(bytes: &[u8]) -> Result<usize, ParseError> {
     let header = bytes
         .get(..HEADER)
         .ok_or(ParseError::Truncated { expected: HEADER, found: bytes.len() })?;
@@ -366,7 +416,7 @@ impl<'a> Sections<'a> {
             if kinds().take(i).any(|earlier| earlier == kind) {
                 return Err(bad);
             }
-            let known = [METADATA, COEFFICIENTS, SELF_TEST].contains(&(kind, encoding));
+            let known = [METADATA, COEFFICIENTS, SELF_TEST, TERMS].contains(&(kind, encoding));
             if kind < OPTIONAL && !known {
                 return Err(ParseError::UnknownSection { kind, encoding });
             }
@@ -394,16 +444,57 @@ impl<'a> Sections<'a> {
     }
 
     fn numbers(&self, section: (u16, u16)) -> Result<&'a [f32], ParseError> {
+        self.cast(section)
+    }
+
+    fn words(&self, section: (u16, u16)) -> Result<&'a [u32], ParseError> {
+        self.cast(section)
+    }
+
+    fn terms(&self) -> Result<&'a [[u8; 2]], ParseError> {
+        self.cast(TERMS)
+    }
+
+    /// The bytes of a section as whole elements, in place.
+    fn cast<T: bytemuck::AnyBitPattern>(&self, section: (u16, u16)) -> Result<&'a [T], ParseError> {
         let bytes = self.bytes(section)?;
         bytemuck::try_cast_slice(bytes).map_err(|_| ParseError::SectionLength {
             kind: section.0,
-            expected: bytes.len().next_multiple_of(4),
+            expected: bytes.len().next_multiple_of(size_of::<T>()),
             found: bytes.len(),
         })
     }
 }
 
-/// Writes a model into `out`, with a prediction from `states` and `inputs` (shapes as in
+/// Leaves a section that may be missing to the reader.
+fn present<T>(section: Result<T, ParseError>) -> Result<Option<T>, ParseError> {
+    match section {
+        Err(ParseError::MissingSection { .. }) => Ok(None),
+        other => other.map(Some),
+    }
+}
+
+/// Cuts the section of the error bounds into its parts.
+fn error_bounds(states: usize, words: &[u32]) -> Result<ErrorBounds<'_>, ParseError> {
+    let per_horizon = states.saturating_add(1);
+    let count = words.get(2).map_or(0, |h| usize::try_from(*h).unwrap_or(usize::MAX));
+    let length = ParseError::SectionLength {
+        kind: ERROR_BOUNDS.0,
+        expected: count.saturating_mul(per_horizon).saturating_add(3).saturating_mul(4),
+        found: words.len().saturating_mul(4),
+    };
+    let ([coverage, units, _], rest) = words.split_first_chunk().ok_or(length)?;
+    let (horizons, bounds) = rest.split_at_checked(count).ok_or(length)?;
+    if bounds.len() != count.saturating_mul(states) {
+        return Err(length);
+    }
+    let bounds = bytemuck::try_cast_slice(bounds).map_err(|_| length)?;
+    ErrorBounds::new(states, f32::from_bits(*coverage), *units, horizons, bounds)
+        .map_err(ParseError::ErrorBounds)
+}
+
+/// Writes a model, dense or sparse and with its error bounds if it has any, into `out`, with a
+/// prediction from `states` and `inputs` (shapes as in
 /// [`SelfTest`]) that may differ by `tolerance` per coordinate, and returns the number of bytes.
 ///
 /// # Errors
@@ -430,7 +521,9 @@ pub fn emit(
     let self_test = [states, inputs, expected, tolerance];
 
     let short = EmitError::BufferTooShort { found: out.len() };
-    let count: usize = if model.ranges().is_some() { 4 } else { 3 };
+    let optional =
+        [model.terms().is_some(), model.ranges().is_some(), model.error_bounds().is_some()];
+    let count = optional.into_iter().fold(3_usize, |n, there| n.saturating_add(there.into()));
     let table = HEADER.saturating_add(count.saturating_mul(ENTRY));
     let mut writer = Writer { out, entry: HEADER, end: table };
     let repr = structure.to_repr();
@@ -439,8 +532,19 @@ pub fn emit(
     writer.close(METADATA, length).ok_or(short)?;
     writer.numbers(COEFFICIENTS, &[model.coefficients()]).ok_or(short)?;
     writer.numbers(SELF_TEST, &self_test).ok_or(short)?;
+    if let Some(terms) = model.terms() {
+        writer.words(TERMS, terms.entries().iter().copied()).ok_or(short)?;
+    }
     if let Some(ranges) = model.ranges() {
         writer.numbers(RANGES, &[ranges]).ok_or(short)?;
+    }
+    if let Some(bounds) = model.error_bounds() {
+        // At most MAX_HORIZON of them.
+        let horizons = bounds.horizons().len() as u32;
+        let head = [bounds.coverage().to_bits(), bounds.units(), horizons];
+        let words = head.iter().chain(bounds.horizons()).copied();
+        let words = words.chain(bounds.bounds().iter().map(|bound| bound.to_bits()));
+        writer.words(ERROR_BOUNDS, words.map(u32::to_le_bytes)).ok_or(short)?;
     }
     let end = writer.end;
     let blob = out.get_mut(..end).ok_or(short)?;
@@ -477,11 +581,19 @@ impl Writer<'_> {
     }
 
     fn numbers(&mut self, section: (u16, u16), parts: &[&[f32]]) -> Option<()> {
+        self.words(section, parts.iter().copied().flatten().map(|number| number.to_le_bytes()))
+    }
+
+    fn words<const N: usize>(
+        &mut self,
+        section: (u16, u16),
+        words: impl Iterator<Item = [u8; N]>,
+    ) -> Option<()> {
         let mut length = 0_usize;
-        for number in parts.iter().copied().flatten() {
+        for word in words {
             let at = self.end.checked_add(length)?;
-            self.out.get_mut(at..at.checked_add(4)?)?.copy_from_slice(&number.to_le_bytes());
-            length = length.checked_add(4)?;
+            self.out.get_mut(at..at.checked_add(N)?)?.copy_from_slice(&word);
+            length = length.checked_add(N)?;
         }
         self.close(section, length)
     }

@@ -1,8 +1,8 @@
 //! What a controller built from this crate has room for.
 //!
 //! A blob is checked against these numbers once, when it is loaded, and a larger model is refused:
-//! one with longer lists than there is room for as undecodable metadata, a larger dictionary with
-//! the field, the capacity and what was found. They bound the size of [`Model`](crate::Model) and
+//! one with longer lists than there is room for as [unsupported](crate::blob::ParseError::Unsupported)
+//! metadata, a larger dictionary or chain of terms with the field, the capacity and what was found. They bound the size of [`Model`](crate::Model) and
 //! [`PredictorState`](crate::PredictorState), not of the coefficients, which stay in flash.
 
 /// State coordinates.
@@ -27,3 +27,13 @@ pub const MAX_ORDER: u8 = 9;
 pub const MAX_BASIS: usize = 2 * MAX_ORDER as usize + 1;
 /// Terms of all blocks together, those held by an earlier block counted again.
 pub const MAX_TERMS: usize = 4096;
+/// Basis functions of all factors of a sparse model, the constant not counted. They are numbered by
+/// a byte, and a step of a sparse model has room for all their values on the stack: 512 bytes in f32.
+pub const MAX_FUNCTIONS: usize = 128;
+/// Terms of a sparse model besides the constant. They are numbered by a byte, and a step of a sparse
+/// model has room for all their values on the stack: 1,024 bytes in f32.
+pub const MAX_SPARSE_TERMS: usize = 255;
+/// The last step that error bounds may be given for.
+pub const MAX_HORIZON: u32 = 65_535;
+
+const _: () = assert!(MAX_FUNCTIONS <= 256 && MAX_SPARSE_TERMS <= 255, "indices are bytes");

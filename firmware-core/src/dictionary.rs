@@ -230,7 +230,33 @@ impl Dictionary {
         })
     }
 
-    /// Terms of all blocks one after the other: the number of coefficients per output in a blob.
+    /// The factors of all blocks, in order.
+    #[inline]
+    pub(crate) fn factors(&self) -> &[Factor] {
+        &self.factors
+    }
+
+    /// Number of basis functions of all factors, the constant not counted.
+    pub fn functions(&self) -> usize {
+        self.factors.iter().fold(0, |sum: usize, f| sum.saturating_add(f.radix()).saturating_sub(1))
+    }
+
+    /// Which basis function of which factor has an index among the [`functions`](Self::functions)
+    /// of all factors, in order: `(factor, digit)`, the digit counted from 1.
+    pub fn function(&self, index: usize) -> Option<(Factor, usize)> {
+        let mut index = index;
+        for factor in &self.factors {
+            let digit = index.saturating_add(1);
+            if digit < factor.radix() {
+                return Some((*factor, digit));
+            }
+            index = digit.saturating_sub(factor.radix());
+        }
+        None
+    }
+
+    /// Terms of all blocks one after the other: the number of coefficients per output in the blob of
+    /// a dense model.
     #[inline]
     pub fn dense_terms(&self) -> usize {
         self.dense_terms.into()
@@ -387,8 +413,14 @@ pub fn fourier<S: Number>(sin: S, cos: S, out: &mut [S]) {
         for (to, value) in pair.iter_mut().zip([s, c]) {
             *to = value;
         }
-        (s, c) = (s * cos + c * sin, c * cos - s * sin);
+        (s, c) = turn((s, c), (sin, cos));
     }
+}
+
+/// Sine and cosine of the sum of two angles.
+#[inline(always)]
+pub(crate) fn turn<S: Number>((s, c): (S, S), (sin, cos): (S, S)) -> (S, S) {
+    (s * cos + c * sin, c * cos - s * sin)
 }
 
 /// The basis functions of a factor at the values of the observables, in `out`.

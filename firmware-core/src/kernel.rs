@@ -10,15 +10,27 @@
 //! that all kernels give the same bits: first the last factors, as many as have together at most 16
 //! coefficients (what a Cortex-M4F loads into its registers at once), the slowest of them first;
 //! then the others, the fastest first.
+//!
+//! # Sparse models
+//!
+//! A [sparse](crate::sparse) model is evaluated in this order, which defines its result to the bit;
+//! every product and every sum is rounded on its own.
+//!
+//! 1. The functions of all factors in order: of a polynomial factor v and vⁿ = vⁿ⁻¹ · v; of a Fourier
+//!    factor s₁ = sin φ, c₁ = cos φ as observed and
+//!    sₙ₊₁ = sₙ · c₁ + cₙ · s₁, cₙ₊₁ = cₙ · c₁ − sₙ · s₁.
+//! 2. The terms in order: t₀ = 1 and tₖ = t_p · f_g for entry k = (p, g). A product with the constant
+//!    is the function itself.
+//! 3. Every output: c₀, then c₀ + c₁ · t₁, and so on in the order of the terms.
 
 use heapless::Vec;
 
 // Sizes of a checked dictionary are small numbers: the wrapping arithmetic below never wraps, and is
 // there because it cannot panic.
 
-use crate::Scalar;
-use crate::capacity::{MAX_BASIS, MAX_BLOCK_FACTORS};
-use crate::dictionary::{Basis, Factor, basis_functions, block_size, observable_pair};
+use crate::capacity::{MAX_BASIS, MAX_BLOCK_FACTORS, MAX_FUNCTIONS, MAX_SPARSE_TERMS};
+use crate::dictionary::{Basis, Factor, basis_functions, block_size, observable_pair, turn};
+use crate::{Number, Scalar};
 
 /// Coefficients of the last factors, which are folded slowest first.
 const REGISTERS: usize = 16;
@@ -287,5 +299,83 @@ fn contract_tile<S: Scalar>(
     };
     for (output, result) in outputs.iter_mut().zip(results) {
         *output = *output + *result;
+    }
+}
+
+/// The functions of the factors of a sparse model.
+pub(crate) type FunctionValues<S> = Vec<S, MAX_FUNCTIONS>;
+/// The terms of a sparse model, the constant first.
+pub(crate) type TermValues<S> = Vec<S, { MAX_SPARSE_TERMS + 1 }>;
+
+/// Appends the functions of the factors, a checked number of them.
+#[inline(always)]
+pub(crate) fn functions<S: Number>(
+    factors: &[Factor],
+    values: &[S],
+    functions: &mut FunctionValues<S>,
+) {
+    for factor in factors {
+        let (v, next) = observable_pair(*factor, values);
+        match factor.basis {
+            Basis::Hermite => {
+                let mut power = v;
+                for _ in 1..factor.order {
+                    let _ = functions.push(power);
+                    power = power * v;
+                }
+                let _ = functions.push(power);
+            }
+            Basis::Fourier => {
+                let (mut s, mut c) = (v, next);
+                for _ in 0..factor.order {
+                    let _ = functions.push(s);
+                    let _ = functions.push(c);
+                    (s, c) = turn((s, c), (v, next));
+                }
+            }
+        }
+    }
+}
+
+/// Appends the constant and the terms of a checked chain.
+#[inline(always)]
+pub(crate) fn chain<S: Number>(entries: &[[u8; 2]], functions: &[S], terms: &mut TermValues<S>) {
+    let _ = terms.push(S::ONE);
+    for [parent, function] in entries {
+        let parent = terms.get(usize::from(*parent)).copied().unwrap_or_default();
+        let function = functions.get(usize::from(*function)).copied().unwrap_or_default();
+        let _ = terms.push(parent * function);
+    }
+}
+
+/// The outputs of a sparse model: `coefficients` has shape `[outputs, terms]`, `outputs` shape
+/// `[outputs]`.
+#[inline(never)]
+pub(crate) fn contract_chain<S: Scalar>(
+    factors: &[Factor],
+    values: &[S],
+    entries: &[[u8; 2]],
+    coefficients: &[S],
+    outputs: &mut [S],
+) {
+    let mut of_factors = FunctionValues::new();
+    functions(factors, values, &mut of_factors);
+    let mut terms = TermValues::new();
+    chain(entries, &of_factors, &mut terms);
+    // Two outputs at a time load every term once and wait for no addition.
+    let (pairs, last) = outputs.as_chunks_mut::<2>();
+    let mut rest = coefficients;
+    for [first, second] in pairs {
+        let (a, others) = rest.split_at_checked(terms.len()).unwrap_or((rest, &[]));
+        let (b, others) = others.split_at_checked(terms.len()).unwrap_or((others, &[]));
+        rest = others;
+        let mut rows = terms.iter().zip(a).zip(b);
+        let Some(((_, a), b)) = rows.next() else { return };
+        (*first, *second) = rows.fold((*a, *b), |(x, y), ((t, a), b)| (x + *a * *t, y + *b * *t));
+    }
+    for output in last {
+        let mut row = terms.iter().zip(rest);
+        let Some((_, a)) = row.next() else { return };
+        *output = row.fold(*a, |x, (t, a)| x + *a * *t);
     }
 }

@@ -28,6 +28,8 @@
 //! | module | what lives there |
 //! |---|---|
 //! | [`dictionary`] | observables, Hermite and Fourier bases, Kronecker blocks, the lift |
+//! | [`sparse`] | single products of basis functions instead of whole blocks |
+//! | [`error_bounds`] | how far off a prediction may be |
 //! | [`model`] | `ModelRepr` (what the bytes say), `Structure` and `Model` (checked once) |
 //! | [`history`] | samples: from coordinates to observables, from outputs back to coordinates |
 //! | [`blob`] | the bytes of a model: layout, parse, emit |
@@ -51,13 +53,17 @@ compile_error!("blobs are little-endian and are read in place");
 pub mod blob;
 pub mod capacity;
 pub mod dictionary;
+pub mod error_bounds;
 pub mod history;
 mod kernel;
 pub mod model;
 pub mod predictor;
 mod scalar;
+pub mod sparse;
 
 pub use blob::{parse, parse_for, parse_prefix};
+pub use error_bounds::ErrorBounds;
 pub use model::{Model, ModelRepr, Structure};
 pub use predictor::{PredictError, Predictor, PredictorState};
 pub use scalar::{Lanes, Number, Scalar};
+pub use sparse::SparseTerms;

@@ -9,6 +9,8 @@ use serde::{Deserialize, Serialize};
 use crate::Scalar;
 use crate::capacity::{MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_STATES};
 use crate::dictionary::{Block, Dictionary, DictionaryError, Factor, Observable, Source};
+use crate::error_bounds::ErrorBounds;
+use crate::sparse::{SparseError, SparseTerms};
 
 /// Where a state coordinate lives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -154,6 +156,8 @@ pub enum ModelError {
     },
     /// The dictionary does not hold together.
     Dictionary(DictionaryError),
+    /// The terms of a sparse model are not products of functions that are there.
+    Sparse(SparseError),
     /// Some number of elements is not what the metadata asks for.
     DimensionMismatch {
         /// Which one.
@@ -395,12 +399,14 @@ impl<'a> Structure<'a> {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Model<'a, S = f32> {
     structure: Structure<'a>,
+    terms: Option<SparseTerms<'a>>,
     coefficients: &'a [S],
     ranges: Option<&'a [S]>,
+    error_bounds: Option<ErrorBounds<'a>>,
 }
 
 impl<'a, S: Scalar> Model<'a, S> {
-    /// Joins a structure and its coefficients.
+    /// Joins a structure and the coefficients of all terms of its blocks: a dense model.
     ///
     /// `coefficients` has shape `[outputs, dense_terms]`, outputs slowest: the operator F of
     /// z⁺ = Ψ F, transposed, in the *monomial* form of the dictionary (powers of the observables
@@ -415,7 +421,73 @@ impl<'a, S: Scalar> Model<'a, S> {
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
     ) -> Result<Self, ModelError> {
-        let expected = structure.outputs().saturating_mul(structure.dictionary().dense_terms());
+        Self::checked(structure, None, coefficients, ranges)
+    }
+
+    /// Joins a structure whose blocks are single factors, a chain of products of their functions and
+    /// its coefficients: a [sparse](crate::sparse) model.
+    ///
+    /// `terms` are `[parent, function]` of terms 1, 2, …; `coefficients` has shape
+    /// `[outputs, terms + 1]`, outputs slowest, the constant first; `ranges` are as in
+    /// [`new`](Self::new).
+    ///
+    /// # Errors
+    /// [`ModelError::Sparse`], and as [`new`](Self::new).
+    ///
+    /// ```
+    /// use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
+    /// use firmware_core::model::{Input, Model, ModelRepr, Provenance, Space, State, Structure};
+    /// use firmware_core::model::{Symmetry, Target};
+    /// use firmware_core::{Predictor, PredictorState};
+    ///
+    /// // x⁺ = x + 0.5 x² u. Functions of x: 0 is x, 1 is x². Functions of u: 2 is u.
+    /// let observable = |source| Observable { source, lag: 0, centre: 0.0, gain: 1.0 };
+    /// let factor = |observable, order| Factor { observable, basis: Basis::Hermite, order };
+    /// let structure = Structure::try_from(ModelRepr {
+    ///     robot: "cart",
+    ///     sample_time_s: 0.1,
+    ///     states: [State {
+    ///         name: "x", unit: "m", space: Space::Line, target: Target::Absolute, limit: [-9.0, 9.0],
+    ///     }].into_iter().collect(),
+    ///     inputs: [Input { name: "u", unit: "V", range: [-1.0, 1.0] }].into_iter().collect(),
+    ///     symmetry: Symmetry::None,
+    ///     observables: [observable(Source::State(0)), observable(Source::Input(0))].into_iter().collect(),
+    ///     factors: [factor(0, 2), factor(1, 1)].into_iter().collect(),
+    ///     blocks: [Block { factors: 1, max_degree: 0 }; 2].into_iter().collect(),
+    ///     provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+    /// }).unwrap();
+    /// // Terms 1, x, x², x²·u.
+    /// let terms = [[0, 0], [0, 1], [2, 2]];
+    /// let coefficients = [0.0_f32, 1.0, 0.0, 0.5];
+    /// let model = Model::new_sparse(structure, &terms, &coefficients, None).unwrap();
+    ///
+    /// let predictor = Predictor::new(&model);
+    /// let mut state = PredictorState::new();
+    /// predictor.observe(&mut state, &[], &[2.0]).unwrap();
+    /// let mut x = [0.0; 2];
+    /// predictor.rollout(&mut state, &[1.0, -0.25], &mut x).unwrap();
+    /// assert_eq!(x, [4.0, 2.0]); // 2 + 0.5 · 4 · 1, 4 − 0.5 · 16 · 0.25
+    /// ```
+    pub fn new_sparse(
+        structure: Structure<'a>,
+        terms: &'a [[u8; 2]],
+        coefficients: &'a [S],
+        ranges: Option<&'a [S]>,
+    ) -> Result<Self, ModelError> {
+        let terms = SparseTerms::new(structure.dictionary(), terms).map_err(ModelError::Sparse)?;
+        Self::checked(structure, Some(terms), coefficients, ranges)
+    }
+
+    /// Checks the numbers against a structure and the terms it goes with.
+    fn checked(
+        structure: Structure<'a>,
+        terms: Option<SparseTerms<'a>>,
+        coefficients: &'a [S],
+        ranges: Option<&'a [S]>,
+    ) -> Result<Self, ModelError> {
+        let model = Self { structure, terms, coefficients, ranges, error_bounds: None };
+        let structure = &model.structure;
+        let expected = structure.outputs().saturating_mul(model.coefficients_per_output());
         let mismatch =
             |field, expected, found| Err(ModelError::DimensionMismatch { field, expected, found });
         if coefficients.len() != expected {
@@ -437,7 +509,20 @@ impl<'a, S: Scalar> Model<'a, S> {
                 return Err(ModelError::Number { field: "trained range of an observable", index });
             }
         }
-        Ok(Self { structure, coefficients, ranges })
+        Ok(model)
+    }
+
+    /// The same model with these error bounds instead of any it has.
+    ///
+    /// # Errors
+    /// [`ModelError::DimensionMismatch`] if they are for another number of state coordinates.
+    pub fn with_error_bounds(self, error_bounds: ErrorBounds<'a>) -> Result<Self, ModelError> {
+        let (expected, found) = (self.structure.states().len(), error_bounds.states());
+        if expected != found {
+            let field = "states of the error bounds";
+            return Err(ModelError::DimensionMismatch { field, expected, found });
+        }
+        Ok(Self { error_bounds: Some(error_bounds), ..self })
     }
 
     /// Everything but the numbers.
@@ -446,7 +531,19 @@ impl<'a, S: Scalar> Model<'a, S> {
         &self.structure
     }
 
-    /// Shape `[outputs, dense_terms]`, outputs slowest.
+    /// The terms of a sparse model; `None` for a dense one, which has all terms of its dictionary.
+    #[inline]
+    pub fn terms(&self) -> Option<SparseTerms<'a>> {
+        self.terms
+    }
+
+    /// Coefficients per output: dense terms of the dictionary, or sparse terms with the constant.
+    #[inline]
+    pub fn coefficients_per_output(&self) -> usize {
+        self.terms.map_or(self.structure.dictionary().dense_terms(), |terms| terms.count())
+    }
+
+    /// Shape `[outputs, coefficients_per_output]`, outputs slowest.
     #[inline]
     pub fn coefficients(&self) -> &'a [S] {
         self.coefficients
@@ -456,5 +553,11 @@ impl<'a, S: Scalar> Model<'a, S> {
     #[inline]
     pub fn ranges(&self) -> Option<&'a [S]> {
         self.ranges
+    }
+
+    /// How far off the predictions may be, if that was measured.
+    #[inline]
+    pub fn error_bounds(&self) -> Option<ErrorBounds<'a>> {
+        self.error_bounds
     }
 }

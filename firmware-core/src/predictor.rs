@@ -5,7 +5,7 @@ use heapless::Vec;
 use crate::Scalar;
 use crate::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES};
 use crate::history::{History, Sample};
-use crate::kernel::{Scratch, contract};
+use crate::kernel::{Scratch, contract, contract_chain};
 use crate::model::Model;
 
 /// The first time a rollout left the range that the model was trained in.
@@ -203,11 +203,16 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         }
         let mut outputs = [S::ZERO; MAX_OUTPUTS];
         let outputs = outputs.get_mut(..structure.outputs()).unwrap_or_default();
-        let (stride, mut scratch) = (structure.dictionary().dense_terms(), Scratch::new());
-        let mut coefficients = self.model.coefficients();
-        for (_, factors) in structure.dictionary().blocks() {
-            let used = contract(factors, &values, coefficients, stride, outputs, &mut scratch);
-            coefficients = coefficients.get(used..).unwrap_or(&[]);
+        let (dictionary, mut coefficients) = (structure.dictionary(), self.model.coefficients());
+        if let Some(terms) = self.model.terms() {
+            let factors = dictionary.factors();
+            contract_chain(factors, &values, terms.entries(), coefficients, outputs);
+        } else {
+            let (stride, mut scratch) = (dictionary.dense_terms(), Scratch::new());
+            for (_, factors) in dictionary.blocks() {
+                let used = contract(factors, &values, coefficients, stride, outputs, &mut scratch);
+                coefficients = coefficients.get(used..).unwrap_or(&[]);
+            }
         }
         let diverged = PredictError::Diverged { step };
         let mut next = Sample::ZERO;

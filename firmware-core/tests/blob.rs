@@ -1,7 +1,13 @@
 //! Blobs: exact bytes, round trips, and everything that must be refused.
 
+mod bytes;
 mod fixtures;
 
+use bytes::{
+    COEFFICIENTS, ENTRY, ERROR_BOUNDS, HEADER, METADATA, RANGES, SELF_TEST, Section, TERMS,
+    assemble, bytes_of, error, error_after, error_with, numbers_of, seal, sections, set_number,
+    u32_at,
+};
 use firmware_core::blob::{self, EmitError, ParseError};
 use firmware_core::capacity::{
     MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES,
@@ -15,106 +21,6 @@ use firmware_core::{Predictor, PredictorState, parse, parse_for, parse_prefix};
 use fixtures::{Numbers, Slot, at, hermite};
 use proptest::prelude::*;
 use serde::Serialize;
-
-/// A section as the table of `blob` lists it: kind, encoding, bytes without padding.
-type Section = (u16, u16, Vec<u8>);
-
-const HEADER: usize = 16;
-const ENTRY: usize = 12;
-const METADATA: u16 = 1;
-const COEFFICIENTS: u16 = 2;
-const SELF_TEST: u16 = 3;
-const RANGES: u16 = 0x8001;
-
-/// CRC-32 bit by bit, from its definition: reflected polynomial 0xEDB88320, all ones before and
-/// after.
-fn crc32(bytes: impl Iterator<Item = u8>) -> u32 {
-    !bytes.fold(!0, |crc: u32, byte| {
-        (0..8).fold(crc ^ u32::from(byte), |crc, _| {
-            if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 }
-        })
-    })
-}
-
-/// Makes the checksum right again.
-fn seal(blob: &mut [u8]) {
-    let crc = crc32(blob[..12].iter().chain(&blob[16..]).copied());
-    blob[12..16].copy_from_slice(&crc.to_le_bytes());
-}
-
-fn u16_at(bytes: &[u8], offset: usize) -> u16 {
-    u16::from_le_bytes(bytes[offset..offset + 2].try_into().unwrap())
-}
-
-fn u32_at(bytes: &[u8], offset: usize) -> usize {
-    u32::from_le_bytes(bytes[offset..offset + 4].try_into().unwrap()) as usize
-}
-
-/// The sections of a good blob.
-fn sections(blob: &[u8]) -> Vec<Section> {
-    (0..usize::from(u16_at(blob, 6)))
-        .map(|i| HEADER + i * ENTRY)
-        .map(|e| {
-            let (offset, length) = (u32_at(blob, e + 4), u32_at(blob, e + 8));
-            (u16_at(blob, e), u16_at(blob, e + 2), blob[offset..offset + length].to_vec())
-        })
-        .collect()
-}
-
-/// A blob of these sections with a valid checksum, as the format table says.
-fn assemble(sections: &[Section]) -> Vec<u8> {
-    let mut blob = b"KOOP".to_vec();
-    blob.extend(1_u16.to_le_bytes());
-    blob.extend((sections.len() as u16).to_le_bytes());
-    blob.extend([0; 8]);
-    let mut offset = HEADER + sections.len() * ENTRY;
-    for (kind, encoding, bytes) in sections {
-        blob.extend(kind.to_le_bytes());
-        blob.extend(encoding.to_le_bytes());
-        blob.extend((offset as u32).to_le_bytes());
-        blob.extend((bytes.len() as u32).to_le_bytes());
-        offset += bytes.len().next_multiple_of(4);
-    }
-    for (_, _, bytes) in sections {
-        blob.extend(bytes);
-        blob.resize(blob.len().next_multiple_of(4), 0);
-    }
-    let length = blob.len() as u32;
-    blob[8..12].copy_from_slice(&length.to_le_bytes());
-    seal(&mut blob);
-    blob
-}
-
-fn error(bytes: &[u8]) -> ParseError {
-    parse(Slot::new(bytes).bytes()).unwrap_err()
-}
-
-/// The error after changing the blob and making its checksum right.
-fn error_after(blob: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> ParseError {
-    let mut blob = blob.to_vec();
-    change(&mut blob);
-    seal(&mut blob);
-    error(&blob)
-}
-
-/// The error after changing the sections.
-fn error_with(blob: &[u8], change: impl FnOnce(&mut Vec<Section>)) -> ParseError {
-    let mut sections = sections(blob);
-    change(&mut sections);
-    error(&assemble(&sections))
-}
-
-fn bytes_of(numbers: &[f32]) -> Vec<u8> {
-    numbers.iter().flat_map(|v| v.to_le_bytes()).collect()
-}
-
-fn numbers_of(bytes: &[u8]) -> Vec<f32> {
-    bytes.chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
-}
-
-fn set_number(section: &mut Section, index: usize, value: f32) {
-    section.2[4 * index..4 * index + 4].copy_from_slice(&value.to_le_bytes());
-}
 
 fn blobs() -> Vec<(ModelRepr<'static>, Vec<u8>)> {
     fixtures::all().into_iter().map(|repr| (repr.clone(), fixtures::emit(&repr))).collect()
@@ -738,7 +644,7 @@ fn dimensions_beyond_capacity() {
     for change in changes {
         let mut full = Full::new();
         change(&mut full);
-        assert_eq!(error(&full.blob()), ParseError::Metadata);
+        assert_eq!(error(&full.blob()), ParseError::Unsupported);
     }
     let dictionary = |change: Change| {
         let mut full = Full::new();
@@ -779,6 +685,19 @@ fn exercise(model: &Model<'_>, seed: u64) {
     state.history().targets(structure, &next, &mut vec![0.0; structure.outputs()]);
     let mut values = vec![0.0; structure.dictionary().observables().len()];
     state.history().observe(structure, &numbers.take_f32(m), &mut values);
+    if let Some(chain) = model.terms() {
+        let mut lifted = vec![0.0; chain.count() + 1];
+        assert_eq!(chain.lift(structure.dictionary(), &values, &mut lifted), chain.count());
+        for term in [0, 1, chain.count() / 2, chain.count() - 1] {
+            assert_eq!(chain.term(structure.dictionary(), term).is_some(), term < chain.count());
+        }
+    }
+    if let Some(bounds) = model.error_bounds() {
+        for step in [0, 1, 7, 65_535, u32::MAX] {
+            assert!(bounds.bound(step, n - 1).is_none_or(|b| b >= 0.0 && b.is_finite()));
+            assert_eq!(bounds.bound(step, n), None);
+        }
+    }
     let terms = structure.dictionary().dense_terms();
     structure.dictionary().lift_dense(&values, &mut vec![0.0; terms]);
     for dense in [0, 1, terms / 2, terms - 1, terms] {
@@ -792,21 +711,23 @@ fn exercise(model: &Model<'_>, seed: u64) {
 }
 
 /// A blob around metadata that may be anything, with as many numbers as they ask for and a
-/// self-test that accepts any prediction that stays finite.
-fn around(metadata: &[u8], seed: u64) -> Option<Vec<u8>> {
+/// self-test that accepts any prediction that stays finite; a sparse one if `terms` are given.
+fn around(metadata: &[u8], terms: Option<&[[u8; 2]]>, seed: u64) -> Option<Vec<u8>> {
     let repr: ModelRepr<'_> = postcard::from_bytes(metadata).ok()?;
     let structure = Structure::try_from(repr).ok()?;
     let mut numbers = Numbers(seed);
-    let terms = structure.dictionary().dense_terms();
-    let coefficients = numbers.take_f32(structure.outputs() * terms);
+    let width = terms.map_or(structure.dictionary().dense_terms(), |terms| terms.len() + 1);
+    let coefficients = numbers.take_f32(structure.outputs() * width);
     let (n, m) = (structure.states().len(), structure.inputs().len());
     let samples = structure.lag() + 1;
     let self_test = [numbers.take_f32(samples * (n + m)), vec![0.0; n], vec![f32::MAX; n]].concat();
-    Some(assemble(&[
+    let mut sections = vec![
         (METADATA, 1, metadata.to_vec()),
         (COEFFICIENTS, 2, bytes_of(&coefficients)),
         (SELF_TEST, 3, bytes_of(&self_test)),
-    ]))
+    ];
+    sections.extend(terms.map(|terms| (TERMS, 4, terms.concat())));
+    Some(assemble(&sections))
 }
 
 fn source() -> impl Strategy<Value = Source> {
@@ -925,7 +846,7 @@ proptest! {
     /// A few bytes of a good blob overwritten, the checksum made right.
     #[test]
     fn overwritten_bytes(
-        which in 0..11_usize, seed: u64,
+        which in 0..fixtures::all().len(), seed: u64,
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6),
     ) {
         let mut blob = fixtures::emit(&fixtures::all()[which]);
@@ -941,24 +862,90 @@ proptest! {
     /// Overwritten metadata with numbers that fit whatever they have become.
     #[test]
     fn overwritten_metadata(
-        which in 0..11_usize, seed: u64,
+        which in 0..fixtures::all().len(), seed: u64,
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4),
     ) {
-        let mut metadata = sections(&fixtures::emit(&fixtures::all()[which]))[0].2.clone();
+        let repr = &fixtures::all()[which];
+        let mut metadata = sections(&fixtures::emit(repr))[0].2.clone();
         for (at, byte) in changes {
             let at = at.index(metadata.len() - 64); // not the hashes
             metadata[at] = byte;
         }
-        if let Some(blob) = around(&metadata, seed) {
+        let terms = fixtures::terms(&fixtures::structure(repr));
+        if let Some(blob) = around(&metadata, terms, seed) {
             accept(&blob, seed);
         }
+    }
+
+    /// Error bounds with a few bytes overwritten or missing, on every kind of model.
+    #[test]
+    fn overwritten_error_bounds(
+        which in 0..fixtures::all().len(), horizons in 1_u32..4, length in 0_usize..200,
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..3),
+        cut: bool, seed: u64,
+    ) {
+        let repr = &fixtures::all()[which];
+        let mut bounds = bytes_of(&[0.9]);
+        bounds.extend([40, horizons].into_iter().chain(1..=horizons).flat_map(u32::to_le_bytes));
+        let count = horizons as usize * repr.states.len();
+        bounds.extend(bytes_of(&Numbers(seed).map(|v| v.abs() as f32).take(count).collect::<Vec<_>>()));
+        for (at, byte) in &changes {
+            bounds[at.index(12 + 4 * horizons as usize)] = *byte;
+        }
+        if cut {
+            bounds.truncate(length);
+        }
+        let mut sections = sections(&fixtures::emit(repr));
+        sections.push((ERROR_BOUNDS, 5, bounds));
+        let blob = assemble(&sections);
+        if changes.is_empty() && !cut {
+            prop_assert!(parse(Slot::new(&blob).bytes()).unwrap().error_bounds().is_some());
+        }
+        accept(&blob, seed);
     }
 
     /// Models of every shape.
     #[test]
     fn any_metadata(metadata in metadata(), seed: u64) {
-        if let Some(blob) = around(&metadata, seed) {
+        if let Some(blob) = around(&metadata, None, seed) {
             accept(&blob, seed);
         }
+    }
+
+    /// Chains of every shape, good and bad, over dictionaries that can carry one.
+    #[test]
+    fn any_chain(
+        orders in prop::collection::vec(1_u8..4, 1..7),
+        terms in prop::collection::vec(any::<[u8; 2]>(), 0..12),
+        tame: bool, seed: u64,
+    ) {
+        let functions: u8 = orders.iter().sum();
+        let tamed = |(k, [p, g]): (usize, [u8; 2])| [p % (k as u8 + 1), g % functions];
+        let terms: Vec<[u8; 2]> = match tame {
+            true => terms.into_iter().enumerate().map(tamed).collect(),
+            false => terms,
+        };
+        let states = [fixtures::state("x", Space::Line, Target::Increment); 4];
+        let inputs = [fixtures::input("u"); 2];
+        let observables: Vec<_> = (0..4).map(Source::State).chain((0..2).map(Source::Input)).collect();
+        let factors: Vec<_> =
+            orders.iter().enumerate().map(|(o, p)| hermite(o as u8, *p)).collect();
+        let metadata = Metadata {
+            robot: "r",
+            sample_time_s: 0.1,
+            states: &states,
+            inputs: &inputs,
+            symmetry: Symmetry::None,
+            observables: &observables.iter().map(|s| at(*s, 0)).collect::<Vec<_>>(),
+            factors: &factors,
+            blocks: &vec![Block { factors: 1, max_degree: 0 }; factors.len()],
+            provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+        };
+        let blob = around(&metadata.encoded(), Some(&terms), seed).unwrap();
+        let good = |(k, [p, g]): (usize, &[u8; 2])| usize::from(*p) <= k && *g < functions;
+        let outcome = parse(Slot::new(&blob).bytes()).map(drop);
+        let sparse = matches!(outcome, Err(ParseError::Model(ModelError::Sparse(_))));
+        prop_assert_eq!(sparse, !terms.iter().enumerate().all(good), "{:?}", outcome);
+        accept(&blob, seed);
     }
 }

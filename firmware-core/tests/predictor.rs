@@ -171,7 +171,7 @@ fn increments_by_hand() {
 
 /// Random Hermite coefficients that keep angles well defined: 0.3 and small terms.
 fn hermite_coefficients(structure: &Structure<'_>, numbers: &mut Numbers) -> Vec<f64> {
-    let terms = structure.dictionary().dense_terms();
+    let terms = fixtures::width(structure);
     (0..structure.outputs() * terms)
         .map(|i| if i % terms == 0 { 0.3 } else { 0.3 * numbers.next().unwrap() / terms as f64 })
         .collect()
@@ -188,13 +188,16 @@ proptest! {
             let mut numbers = Numbers(seed);
             let structure = fixtures::structure(&repr);
             let (n, m) = (structure.states().len(), structure.inputs().len());
-            let terms = structure.dictionary().dense_terms();
+            let terms = fixtures::terms(&structure);
             let hermite = hermite_coefficients(&structure, &mut numbers);
-            let powers: Vec<f64> = hermite
-                .chunks(terms)
-                .flat_map(|row| naive::monomials(structure.dictionary(), row))
-                .collect();
-            let model = Model::new(structure.clone(), &powers, None).unwrap();
+            let powers: Vec<f64> = match terms {
+                None => hermite
+                    .chunks(structure.dictionary().dense_terms())
+                    .flat_map(|row| naive::monomials(structure.dictionary(), row))
+                    .collect(),
+                Some(_) => hermite.clone(),
+            };
+            let model = fixtures::model(structure.clone(), &powers, None).unwrap();
             let predictor = Predictor::new(&model);
             let mut state = PredictorState::new();
             let mut log = naive::Log { x: vec![], u: vec![] };
@@ -211,7 +214,7 @@ proptest! {
             for _ in 0..5 {
                 let u = numbers.take_f64(m);
                 predictor.step(&mut state, &u).unwrap();
-                let expected = naive::step(&structure, &log, &u, &hermite);
+                let expected = naive::step(&structure, terms, &log, &u, &hermite);
                 let found = coordinates(&predictor, &state);
                 let distance = naive::distance(&structure, &found, &expected);
                 prop_assert!(distance < 1e-10, "{}: {}", repr.robot, distance);
@@ -281,7 +284,7 @@ proptest! {
             let mut numbers = Numbers(seed);
             let coefficients = fixtures::coefficients(&structure);
             let coefficients: Vec<f64> = coefficients.into_iter().map(f64::from).collect();
-            let model = Model::new(structure.clone(), &coefficients, None).unwrap();
+            let model = fixtures::model(structure.clone(), &coefficients, None).unwrap();
             let state = fixtures::fill(&Predictor::new(&model), &mut numbers);
             let mut history = state.history().clone();
             let mut next = numbers.take_f64(n);
@@ -306,8 +309,8 @@ proptest! {
             let (n, m) = (structure.states().len(), structure.inputs().len());
             let single = fixtures::coefficients(&structure);
             let double: Vec<f64> = single.iter().map(|c| f64::from(*c)).collect();
-            let model32 = Model::new(structure.clone(), &single, None).unwrap();
-            let model64 = Model::new(structure.clone(), &double, None).unwrap();
+            let model32 = fixtures::model(structure.clone(), &single, None).unwrap();
+            let model64 = fixtures::model(structure.clone(), &double, None).unwrap();
             let (p32, p64) = (Predictor::new(&model32), Predictor::new(&model64));
             let (mut s32, mut s64) = (PredictorState::new(), PredictorState::new());
             let mut numbers = Numbers(seed);
@@ -336,7 +339,7 @@ proptest! {
             let (n, m) = (structure.states().len(), structure.inputs().len());
             let coefficients: Vec<f64> =
                 fixtures::coefficients(&structure).into_iter().map(f64::from).collect();
-            let model = Model::new(structure, &coefficients, None).unwrap();
+            let model = fixtures::model(structure, &coefficients, None).unwrap();
             let predictor = Predictor::new(&model);
             let mut numbers = Numbers(seed);
             let start = fixtures::fill(&predictor, &mut numbers);
@@ -421,7 +424,7 @@ fn not_ready_until_the_history_is_full() {
         let (n, m, need) =
             (structure.states().len(), structure.inputs().len(), structure.lag() + 1);
         let coefficients = fixtures::coefficients(&structure);
-        let model = Model::new(structure, &coefficients, None).unwrap();
+        let model = fixtures::model(structure, &coefficients, None).unwrap();
         let predictor = Predictor::new(&model);
         let mut state = PredictorState::new();
         let (u, x) = (vec![0.1; m], vec![0.1; n]);
@@ -665,7 +668,7 @@ fn inputs_that_are_no_numbers() {
         let structure = fixtures::structure(&repr);
         let f: Vec<f64> = fixtures::coefficients(&structure).into_iter().map(f64::from).collect();
         let m = structure.inputs().len();
-        let model = Model::new(structure, &f, None).unwrap();
+        let model = fixtures::model(structure, &f, None).unwrap();
         let predictor = Predictor::new(&model);
         let mut state = fixtures::fill(&predictor, &mut Numbers(5));
         for bad in [f64::NAN, f64::INFINITY].into_iter().filter(|_| m > 0) {

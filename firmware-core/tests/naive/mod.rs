@@ -67,6 +67,31 @@ pub fn powers(dictionary: &Dictionary, values: &[f64]) -> Vec<f64> {
         .collect()
 }
 
+/// The functions of all factors, constants left out, in closed form.
+pub fn functions(dictionary: &Dictionary, values: &[f64]) -> Vec<f64> {
+    let factors = dictionary.blocks().flat_map(|(_, own)| own);
+    factors
+        .flat_map(|f| match f.basis {
+            Basis::Hermite => {
+                let v = values[usize::from(f.observable)];
+                (1..=f.order).map(|n| v.powi(n.into())).collect()
+            }
+            Basis::Fourier => basis(*f, values).split_off(1),
+        })
+        .collect()
+}
+
+/// The terms of a chain, the constant first: every one multiplied from all its functions anew.
+pub fn sparse(dictionary: &Dictionary, terms: &[[u8; 2]], values: &[f64]) -> Vec<f64> {
+    let functions = functions(dictionary, values);
+    let mut all = vec![vec![]];
+    for [parent, function] in terms {
+        let own: Vec<u8> = [&all[usize::from(*parent)][..], &[*function]].concat();
+        all.push(own);
+    }
+    all.iter().map(|own| own.iter().map(|g| functions[usize::from(*g)]).product()).collect()
+}
+
 /// A basis function that is not the constant, one name for one function: (observable, order) for
 /// Hermite, (100 + observable, harmonic) for higher harmonics.
 type Function = (usize, usize);
@@ -223,10 +248,20 @@ pub fn retract(structure: &Structure<'_>, present: &[f64], outputs: &[f64]) -> V
     next
 }
 
-/// One step with Hermite coefficients `[outputs][dense_terms]`.
-pub fn step(structure: &Structure<'_>, log: &Log, input: &[f64], hermite: &[f64]) -> Vec<f64> {
-    let lifted = lift_dense(structure.dictionary(), &observables(structure, log, input));
-    let outputs: Vec<f64> = hermite
+/// One step with Hermite coefficients `[outputs][dense_terms]`, or with those of sparse terms.
+pub fn step(
+    structure: &Structure<'_>,
+    terms: Option<&[[u8; 2]]>,
+    log: &Log,
+    input: &[f64],
+    coefficients: &[f64],
+) -> Vec<f64> {
+    let values = observables(structure, log, input);
+    let lifted = match terms {
+        None => lift_dense(structure.dictionary(), &values),
+        Some(terms) => sparse(structure.dictionary(), terms, &values),
+    };
+    let outputs: Vec<f64> = coefficients
         .chunks(lifted.len())
         .map(|row| row.iter().zip(&lifted).map(|(c, t)| c * t).sum())
         .collect();
