@@ -40,8 +40,9 @@
 //! # The leg's post-processing
 //!
 //! The tip has measurement noise of 0.1 mm and is then smoothed by a centred moving average over
-//! 5 samples, as in the paper; at the ends the window shrinks symmetrically (3, then 1), so that it
-//! stays centred. A smoothed sample has seen two samples of the future. Inputs are not smoothed.
+//! 5 samples, as in the paper; two samples of the resting leg before the log and two more of the
+//! last voltages after it serve the averages at its ends. A smoothed sample has seen two samples of
+//! the future, and shares noise with its neighbours. Inputs are not smoothed.
 //!
 //! # Randomness
 //!
@@ -294,7 +295,14 @@ impl<P: Plant<OUTPUTS, 2> + Clone + 'static, const OUTPUTS: usize> Setup<P, OUTP
         let Self { plant, rate_hz, sensor, window, .. } = self;
         let (plant, rate_hz, sensor, window) = (plant.clone(), *rate_hz, *sensor, *window);
         let write_trial = move |trial, out: &mut dyn io::Write| {
+            // Samples before and after the log, for the average of its first and last ones: the
+            // robot rests, and goes on.
+            let beyond = window / 2;
             let inputs = input.of_trial(trial, seed, source);
+            let last = inputs.last().copied();
+            let inputs = iter::repeat_n([0.0; 2], beyond)
+                .chain(inputs)
+                .chain(last.into_iter().flat_map(move |last| iter::repeat_n(last, beyond)));
             let noise_rng = stream(seed.into(), NOISE_STREAM + source.stream(trial));
             let rows: Vec<_> = rows(plant.clone(), rate_hz, inputs, sensor, noise_rng).collect();
             write_csv(out, &plant, rate_hz, smoothed(&rows, window, sensor.decimals))
@@ -335,17 +343,16 @@ impl<P: Plant<OUTPUTS, 2> + Clone + 'static, const OUTPUTS: usize> Setup<P, OUTP
     }
 }
 
-/// The rows with their outputs averaged over a centred window, narrower near the ends, and rounded.
+/// The rows that have a whole centred window around them, with their outputs averaged over it and
+/// rounded.
 fn smoothed<const OUTPUTS: usize>(
     rows: &[Row<OUTPUTS, 2>],
     window: usize,
     decimals: Option<u8>,
 ) -> impl Iterator<Item = Row<OUTPUTS, 2>> {
-    (0..rows.len()).map(move |k| {
-        let half = (window / 2).min(k).min(rows.len() - 1 - k);
-        let around = &rows[k - half..=k + half];
-        let (outputs, input) = rows[k];
-        if half == 0 {
+    rows.windows(window).map(move |around| {
+        let (outputs, input) = around[window / 2];
+        if window == 1 {
             return (outputs, input);
         }
         let mean = std::array::from_fn(|i| {
@@ -391,8 +398,13 @@ impl PaperLogs {
         self.write_files(&new)?;
         make_dir(&old)?;
         // Without its manifest a set is incomplete: it leaves first and arrives last.
-        move_entries(dir, &old, |name| name != MANIFEST)?;
-        move_entries(&new, dir, |name| name == MANIFEST)
+        let moved = move_entries(dir, &old, |name| name != MANIFEST)
+            .and_then(|()| move_entries(&new, dir, |name| name == MANIFEST));
+        if moved.is_err() {
+            // Nothing is lost: what has not arrived stays beside `dir`.
+            let _ = aside.keep();
+        }
+        moved
     }
 
     /// Writes the logs and then the manifest into `dir`, which does not exist yet.
@@ -862,17 +874,14 @@ mod tests {
     }
 
     #[test]
-    fn moving_average_is_centred_and_narrows_at_the_ends() {
+    fn moving_average_is_centred() {
         let rows: Vec<Row<2, 2>> =
             [3.0, 1.0, 4.0, 1.0, 5.0, 9.0].iter().map(|&y| ([y, -y], [y; 2])).collect();
         let smooth: Vec<_> = smoothed(&rows, 5, Some(4)).collect();
-        let outputs: Vec<f64> = smooth.iter().map(|(outputs, _)| outputs[0]).collect();
-        assert_eq!(outputs, [3.0, 2.6667, 2.8, 4.0, 5.0, 9.0]);
-        assert!(smooth.iter().all(|(outputs, _)| outputs[1] == -outputs[0]));
-        assert!(smooth.iter().zip(&rows).all(|((_, smooth), (_, raw))| smooth == raw));
+        assert_eq!(smooth, [([2.8, -2.8], [4.0; 2]), ([4.0, -4.0], [1.0; 2])]);
         // A window of one row changes nothing, whatever the decimals.
         assert!(smoothed(&rows, 1, None).eq(rows.iter().copied()));
-        assert_eq!(smoothed(&rows[..0], 5, None).count(), 0);
+        assert_eq!(smoothed(&rows[..4], 5, None).count(), 0);
     }
 
     #[test]
@@ -890,9 +899,7 @@ mod tests {
                     (outputs, [row[3], row[4]])
                 })
                 .collect();
-            let inner = 2..rows.len() - 2;
-            for (row, (quiet, _)) in rows[inner.clone()].iter().zip(smoothed(&raw, 5, None).skip(2))
-            {
+            for (row, (quiet, _)) in rows[2..].iter().zip(smoothed(&raw, 5, None)) {
                 residuals.extend([row[1] - quiet[0], row[2] - quiet[1]]);
             }
         }

@@ -106,7 +106,7 @@ impl fmt::Display for Robot {
 
 /// The text names no robot.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("unknown robot `{text}`: expected rosbot, two-link-arm or soft-leg")]
+#[error("unknown robot `{text}`: expected rosbot, two-link-arm, soft-leg or paper")]
 pub struct UnknownRobot {
     /// What was given.
     pub text: String,

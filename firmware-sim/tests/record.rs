@@ -203,7 +203,11 @@ fn impossible_settings_are_refused_with_the_reason_and_no_output() {
     let out = dir.path().join("logs");
     let out = out.to_str().unwrap();
     let cases: [(&str, &[&str], &str); 13] = [
-        ("hexapod", &[], "unknown robot `hexapod`: expected rosbot, two-link-arm or soft-leg"),
+        (
+            "hexapod",
+            &[],
+            "unknown robot `hexapod`: expected rosbot, two-link-arm, soft-leg or paper",
+        ),
         ("rosbot", &["--seconds", "0"], "duration must be finite and above 0 s, not 0"),
         ("rosbot", &["--seconds", "-3"], "duration must be finite and above 0 s, not -3"),
         ("rosbot", &["--seconds", "NaN"], "duration must be finite and above 0 s, not NaN"),

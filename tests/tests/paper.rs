@@ -69,33 +69,19 @@ fn the_papers_dictionary_pooled_is_at_or_below_the_papers_errors() {
     let averaged = rollout(Method::AcdEdmdAveraged);
     assert!(averaged[1] > 10.0 * rollout(Method::AcdEdmd)[1], "{averaged:?}");
 
-    // What no motion scores on the arm is what the paper's method scores.
+    // The paper prints about the error of no motion for the arm.
     let still = one_step(results.test(arm, "arm-euler/quadrant").unwrap(), Method::NoMotion);
     assert_at_most(&still, &[0.0015, 0.0036]);
-
-    // Errors fall with the number of terms, distances with the number of samples.
-    let columns = &results.convergence.columns;
-    assert_eq!(columns.iter().map(|c| c.terms).collect::<Vec<_>>(), [4, 9, 16, 25, 36]);
-    let last = |values: &[Option<f64>]| values.last().copied().flatten().unwrap();
-    for pair in columns.windows(2) {
-        assert!(last(&pair[1].error) < 0.5 * last(&pair[0].error));
-    }
-    for column in columns {
-        let at = |samples: u64| {
-            let i = results.convergence.samples.iter().position(|m| *m == samples).unwrap();
-            column.distance[i].unwrap()
-        };
-        assert!(at(20_000) < 0.2 * at(50), "{:?}", column.distance);
-    }
 }
 
 #[test]
-fn the_recommended_dictionaries_roll_out_better_than_everything_else_on_simulated_rigid_robots() {
+fn the_recommended_dictionaries_roll_out_ten_times_better_on_simulated_rigid_robots() {
     let others = [
         Method::Hermite,
         Method::SindyLasso,
         Method::SindyThresholded,
         Method::AcdEdmd,
+        Method::AcdEdmdAveraged,
         Method::NoMotion,
         Method::Arx,
     ];
@@ -145,6 +131,25 @@ fn figures_are_drawn_from_the_results() {
         assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{name}");
         assert!(svg.matches("<polyline").count() > 2 && !svg.contains("NaN"), "{name}");
     }
+}
+
+#[test]
+fn a_set_with_a_piece_missing_is_refused_before_any_work() {
+    let dir = TempDir::new().unwrap();
+    PaperLogs::new(1).write(dir.path(), false).unwrap();
+    let run = |said: &dyn Fn(usize, usize, &str)| {
+        reproduce::run(dir.path(), &Method::ALL, said).unwrap_err().to_string()
+    };
+    let quiet = |_: usize, _: usize, _: &str| panic!("nothing is done yet");
+    let last = dir.path().join("leg-walk/test/trial-000.csv");
+    let text = std::fs::read_to_string(&last).unwrap();
+    let cut: Vec<&str> = text.lines().take(20).collect();
+    std::fs::write(&last, cut.join("\n") + "\n").unwrap();
+    let message = run(&quiet);
+    assert!(message.contains("leg-walk/test: a trajectory of 19 rows"), "{message}");
+    assert!(message.contains("paper.toml says 1 trajectories of 61 rows"), "{message}");
+    std::fs::remove_file(dir.path().join("drive-euler/validation/trial-042.csv")).unwrap();
+    assert!(run(&quiet).contains("drive-euler/validation: 99 trajectories"));
 }
 
 #[test]

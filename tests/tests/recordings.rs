@@ -30,7 +30,7 @@ fn scored(description: &str, logs: &Path) -> Score {
     let source = Logs { recording: &recording, schema: &robot.schema };
     let fit = edmd::fit(&robot, &source, &|_| ()).unwrap();
     let counts = Counts { trajectories: fit.summary.trajectories, rows: fit.summary.rows };
-    let lifted = Lifted::Fitted(&fit.structure, &robot.fit);
+    let lifted = Lifted::Fitted(&fit.structure, None, &robot.fit);
     score::score(&source, counts, lifted, &robot.score, None, &|_| ()).unwrap()
 }
 

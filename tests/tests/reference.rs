@@ -287,7 +287,8 @@ impl Authors {
 
     /// The same columns without squaring the condition number.
     fn qr(&self, trajectory: &Values) -> Vec<f64> {
-        let mut regression = Regression::new(&self.dictionary, self.columns.len(), Method::Qr);
+        let mut regression =
+            Regression::new(&self.dictionary, None, self.columns.len(), Method::Qr);
         for pair in trajectory.windows(2) {
             let next = self.lift(&pair[1]);
             let targets: Vec<f64> = self.columns.iter().map(|c| next[*c]).collect();

@@ -203,11 +203,13 @@ impl Arx {
     }
 }
 
-/// The ARX as a [`Forecast`]: the models with 0, 1, … lags, of which the one with as many lags as
-/// there are earlier samples predicts.
+/// The ARX as a [`Forecast`]: the models with 0, 1, … lags. Where there are fewer earlier samples
+/// than lags, the model with as many lags as there are predicts, or the robot is taken to have rested
+/// at the first sample with no input.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ArxForecast {
     models: Vec<Arx>,
+    rested: bool,
 }
 
 impl ArxForecast {
@@ -225,12 +227,13 @@ impl ArxForecast {
             }
         }
         let models = (0..=MAX_LAGS).map(|lags| sums.fit(lags)).collect::<Option<_>>()?;
-        Some(Self { models })
+        Some(Self { models, rested: false })
     }
 
-    /// The same with no more than `lags` lags.
-    pub fn with_lags(&self, lags: usize) -> Self {
-        Self { models: self.models[..(lags + 1).min(self.models.len())].to_vec() }
+    /// The same with no more than `lags` lags; `rested` says whether the robot rested before the
+    /// first sample.
+    pub fn with_lags(&self, lags: usize, rested: bool) -> Self {
+        Self { models: self.models[..(lags + 1).min(self.models.len())].to_vec(), rested }
     }
 }
 
@@ -242,16 +245,25 @@ fn rows<'t>(states: &'t [f64], inputs: &'t [f64], n: usize) -> impl Iterator<Ite
 }
 
 impl Forecast for ArxForecast {
+    fn numbers(&self) -> usize {
+        let last = self.models.last();
+        last.map_or(0, |arx| arx.constant.iter().chain(&arx.weights).filter(|w| **w != 0.0).count())
+    }
+
     fn predict(&self, states: &[f64], inputs: &[f64], next: &mut [f64]) -> bool {
         let n = next.len();
         let samples = states.len() / n.max(1);
-        let Some(model) = self.models[..samples.min(self.models.len())].last() else {
-            return false;
-        };
-        let m = inputs.len() / samples;
-        let used = samples - 1 - model.lags;
-        let recent: Vec<Vec<f64>> = rows(&states[used * n..], &inputs[used * m..], n).collect();
-        model.predict(recent.iter().rev().map(Vec::as_slice), next);
+        let usable = if self.rested { self.models.len() } else { samples.min(self.models.len()) };
+        let Some(model) = self.models[..usable].last() else { return false };
+        let m = inputs.len() / samples.max(1);
+        let used = samples.saturating_sub(1 + model.lags);
+        let mut recent: Vec<Vec<f64>> = rows(&states[used * n..], &inputs[used * m..], n).collect();
+        recent.reverse();
+        if let Some(first) = recent.last() {
+            let rest = [&first[..n], &vec![0.0; m]].concat();
+            recent.resize(recent.len().max(model.lags + 1), rest);
+        }
+        model.predict(recent.iter().map(Vec::as_slice), next);
         next.iter().all(|x| x.is_finite())
     }
 }
@@ -288,8 +300,11 @@ mod tests {
         let mut worst =
             |arx: &ArxForecast| (2..60).map(|k| error(arx, k)).fold(0.0_f64, |a, e| a.max(e));
         assert!(worst(&arx) < 1e-4);
-        assert!(worst(&arx.with_lags(0)) > 0.1, "no lag, no oscillation");
+        assert!(worst(&arx.with_lags(0, false)) > 0.1, "no lag, no oscillation");
         assert!(error(&arx, 1) > 1e-2, "nothing to look back at");
+        // At rest at 1 before: 1.5 − 0.7.
+        arx.with_lags(1, true).predict(&[1.0], &[0.3], &mut next);
+        assert!((next[0] - 0.8).abs() < 1e-4, "{next:?}");
         assert!(ArxForecast::fit(Data { trajectories: &[], ..data }).is_none());
     }
 }

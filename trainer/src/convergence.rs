@@ -1,137 +1,167 @@
-//! How the estimate converges: the operator from the first M snapshot pairs over dictionaries of N
-//! terms, scored on other data.
+//! How the estimate converges to the Koopman operator as samples and terms grow (Shi & Karydis
+//! 2021, theorem 3.1), on a nonlinear map whose operator is known:
 //!
-//! Shi & Karydis 2021, theorem 3.1: K estimated from M samples over N Hermite functions tends to
-//! the Koopman operator as both grow, for observables that are square-integrable under the
-//! Gaussian weight. Where the dictionary's variables are normally distributed, as the paper's wheel
-//! speeds are, the mean over test data is that weight's integral.
+//! ```text
+//! x⁺ = 2 asinh(λ sinh(x/2)),  x ~ N(0, 1)
+//! ```
+//!
+//! sinh(x/2) is an eigenfunction with the eigenvalue λ, its powers with the powers of λ; none of them is
+//! a polynomial, so that no finite Hermite dictionary holds them. Under N(0, 1) the polynomials are
+//! orthogonal, and every observable used here is square-integrable.
 
-use firmware_core::model::Provenance;
+use std::path::Path;
 
-use crate::edmd::{FitError, Regression};
-use crate::forecast::Data;
-use crate::koopman::KoopmanError;
-use crate::robot::Robot;
-use crate::snapshots::{PairSink, Snapshots};
-use crate::terms::distinct_terms;
-use crate::trajectory::Trajectories;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
 
-/// One dictionary of the study.
-#[derive(Clone, Debug, PartialEq)]
+use crate::full_operator::FullOperator;
+use crate::robot::{Robot, RobotError};
+use crate::trajectory::{InMemory, Trajectory};
+
+/// λ.
+pub const EIGENVALUE: f64 = 0.8;
+
+/// Samples M, orders of the Hermite polynomials (N = order + 1 terms) and repetitions.
+const SAMPLES: [usize; 7] = [30, 100, 300, 1000, 3000, 10_000, 30_000];
+const ORDERS: [u8; 5] = [1, 3, 5, 7, 9];
+const DRAWS: u64 = 10;
+/// The integral under the Gaussian weight is a sum over this many points in ±[`REACH`]: beyond, the
+/// weight is below 1e-22.
+const POINTS: i32 = 2001;
+const REACH: f64 = 10.0;
+
+/// The study: rows are numbers of samples, columns numbers of terms.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Convergence {
+    /// λ.
+    pub eigenvalue: f64,
+    /// M.
+    pub samples: Vec<usize>,
+    /// Independent draws of M samples; errors are root mean squares over them.
+    pub draws: u64,
+    /// One per dictionary.
+    pub columns: Vec<Column>,
+}
+
+/// One dictionary.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Column {
     /// Terms N.
     pub terms: usize,
-    /// Root mean square of what the operator from M pairs predicts wrongly on the test data, over
-    /// the outputs asked for, per number of samples; `None` where M pairs do not determine it.
-    pub error: Vec<Option<f64>>,
-    /// Root mean square difference on the test data between the predictions of the operator from M
-    /// pairs and of that from all: how far the estimate is from its own limit.
-    pub distance: Vec<Option<f64>>,
+    /// Distance from λ to the nearest eigenvalue of the estimate, for each M; `None` where M samples
+    /// do not determine it.
+    pub eigenvalue_error: Vec<Option<f64>>,
+    /// The error of the predicted next x under the Gaussian weight, √∫ |Ψ K B − x⁺|² w, for each M.
+    pub prediction_error: Vec<Option<f64>>,
 }
 
-/// Fits operators to the first `samples[i]` pairs of `training` for every robot (the same robot
-/// with dictionaries of growing order) and scores the first `outputs` outputs on `test`.
+fn map(x: f64) -> f64 {
+    2.0 * libm::asinh(EIGENVALUE * libm::sinh(x / 2.0))
+}
+
+/// One sample of N(0, 1) (Box & Muller 1958).
+fn normal(rng: &mut ChaCha8Rng) -> f64 {
+    // In (0, 1]: the logarithm is finite.
+    let radius = libm::sqrt(-2.0 * libm::log(1.0 - rng.random::<f64>()));
+    radius * libm::cos(std::f64::consts::TAU * rng.random::<f64>())
+}
+
+/// Runs the study.
 ///
 /// # Errors
-/// [`FitError`]: a robot that the core refuses, or all pairs do not determine its operator.
-pub fn study(
-    robots: &[Robot],
-    samples: &[u64],
-    outputs: usize,
-    training: Data<'_>,
-    test: Data<'_>,
-) -> Result<Vec<Column>, KoopmanError> {
-    robots.iter().map(|robot| column(robot, samples, outputs, training, test)).collect()
+/// [`RobotError`] does not occur: the description of the map is built in.
+pub fn study(seed: u64) -> Result<Convergence, RobotError> {
+    let stream = |number: u64| {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(number);
+        rng
+    };
+    let most = SAMPLES[SAMPLES.len() - 1];
+    let draws: Vec<Vec<Trajectory>> = (0..DRAWS)
+        .map(|draw| {
+            let mut rng = stream(draw);
+            let pair = |x| Trajectory { states: vec![x, map(x)], inputs: Vec::new() };
+            (0..most).map(|_| pair(normal(&mut rng))).collect()
+        })
+        .collect();
+    let mut columns = Vec::new();
+    for order in ORDERS {
+        let text = format!(
+            "name = \"map\"\nsample_time_s = 1\nstates = [{{ name = \"x\", space = \"R\" }}]\n\
+             [dictionary]\norder = {order}\nstandardise = false\n"
+        );
+        let robot = Robot::parse(&text, Path::new("built-in robot.toml"))?;
+        let mut column =
+            Column { terms: 0, eigenvalue_error: Vec::new(), prediction_error: Vec::new() };
+        for samples in SAMPLES {
+            let mut squares = (0.0, 0.0);
+            let mut determined = true;
+            for draw in &draws {
+                let Some((terms, errors)) = errors(&robot, &draw[..samples]) else {
+                    determined = false;
+                    break;
+                };
+                column.terms = terms;
+                squares.0 += errors.0 * errors.0;
+                squares.1 += errors.1 * errors.1;
+            }
+            let root = |sum: f64| determined.then(|| libm::sqrt(sum / DRAWS as f64));
+            column.eigenvalue_error.push(root(squares.0));
+            column.prediction_error.push(root(squares.1));
+        }
+        columns.push(column);
+    }
+    Ok(Convergence { eigenvalue: EIGENVALUE, samples: SAMPLES.to_vec(), draws: DRAWS, columns })
 }
 
-fn column(
-    robot: &Robot,
-    samples: &[u64],
-    outputs: usize,
-    training: Data<'_>,
-    test: Data<'_>,
-) -> Result<Column, KoopmanError> {
-    let provenance = Provenance { logs: [0; 32], robot: robot.sha256 };
-    let scaling = robot.identity_scaling();
-    let structure =
-        robot.structure(&scaling, &robot.limits(), provenance).map_err(FitError::Model)?;
-    let m = structure.outputs();
+/// Terms, and the errors of the eigenvalue and of the prediction, of the estimate from some pairs.
+fn errors(robot: &Robot, pairs: &[Trajectory]) -> Option<(usize, (f64, f64))> {
+    let source = InMemory { trajectories: pairs, states: 1, inputs: 0 };
+    let full = FullOperator::fit(robot, &source, &|_| {}).ok()?;
+    let spectrum = full.spectrum(&[]).ok()?;
+    let distance = |(re, im): &(f64, f64)| libm::hypot(re - EIGENVALUE, *im);
+    let eigenvalue = spectrum.eigenvalues().iter().map(distance).fold(f64::INFINITY, f64::min);
+    let (n, m) = (full.terms(), full.columns.len());
+    let k = full.held(&[]).ok()?;
+    let column: Vec<f64> =
+        (0..n).map(|i| (0..n).map(|j| k[i * n + j] * full.b[j * m]).sum()).collect();
+    // The trapezoidal rule converges geometrically for what decays like a Gaussian.
+    let step = 2.0 * REACH / f64::from(POINTS - 1);
+    let weighted_square = |i: i32| {
+        let x = f64::from(i) * step - REACH;
+        let predicted: f64 = full.lift(&[x]).iter().zip(&column).map(|(psi, c)| psi * c).sum();
+        let weight = libm::exp(-x * x / 2.0) / libm::sqrt(std::f64::consts::TAU);
+        weight * step * (predicted - map(x)) * (predicted - map(x))
+    };
+    let integral: f64 = (0..POINTS).map(weighted_square).sum();
+    Some((n, (eigenvalue, libm::sqrt(integral))))
+}
 
-    struct Training<'s> {
-        regression: Regression,
-        pairs: u64,
-        samples: &'s [u64],
-        snapshots: Vec<Regression>,
-    }
-    impl PairSink for Training<'_> {
-        fn pair(&mut self, _: u64, values: &[f64], targets: &[f64]) {
-            self.regression.push(values, targets);
-            self.pairs += 1;
-            if self.samples.contains(&self.pairs) {
-                self.snapshots.push(self.regression.clone());
-            }
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_fall_with_samples_and_terms() {
+        let study = study(1).unwrap();
+        assert_eq!(study.columns.iter().map(|c| c.terms).collect::<Vec<_>>(), [2, 4, 6, 8, 10]);
+        let last = |values: &[Option<f64>]| values[values.len() - 1].unwrap();
+        for pair in study.columns.windows(2) {
+            assert!(last(&pair[1].prediction_error) < 0.7 * last(&pair[0].prediction_error));
+            assert!(last(&pair[1].eigenvalue_error) < 0.7 * last(&pair[0].eigenvalue_error));
+        }
+        for column in &study.columns[1..] {
+            let first = column.prediction_error.iter().flatten().next().unwrap();
+            assert!(last(&column.prediction_error) < 0.7 * first, "{column:?}");
         }
     }
-    let regression = Regression::new(structure.dictionary(), m, robot.fit.method);
-    let sink = Training { regression, pairs: 0, samples, snapshots: Vec::new() };
-    let mut pass = Snapshots::new(&structure, sink);
-    training.source().visit(&mut pass).map_err(FitError::Trajectories)?;
-    let Training { regression, snapshots, .. } = pass.into_sink();
-    let last = crate::edmd::solve_named(robot, &structure, regression)?;
-    let operators: Vec<Option<Vec<f64>>> = (0..samples.len())
-        .map(|i| snapshots.get(i)?.clone().solve(&robot.fit, m).ok().map(|o| o.matrix))
-        .collect();
 
-    struct Test<'o> {
-        dictionary: firmware_core::dictionary::Dictionary,
-        distinct: Vec<usize>,
-        dense: Vec<f64>,
-        outputs: (usize, usize),
-        last: &'o [f64],
-        operators: &'o [Option<Vec<f64>>],
-        /// Squared errors and squared distances.
-        sums: Vec<(f64, f64)>,
-        count: f64,
-    }
-    impl PairSink for Test<'_> {
-        fn pair(&mut self, _: u64, values: &[f64], targets: &[f64]) {
-            self.dictionary.lift_dense(values, &mut self.dense);
-            let (scored, m) = self.outputs;
-            let predict = |matrix: &[f64], j: usize| -> f64 {
-                self.distinct
-                    .iter()
-                    .enumerate()
-                    .map(|(i, t)| self.dense[*t] * matrix[i * m + j])
-                    .sum()
-            };
-            for (sum, operator) in self.sums.iter_mut().zip(self.operators) {
-                let Some(operator) = operator else { continue };
-                for (j, target) in targets.iter().enumerate().take(scored) {
-                    let predicted = predict(operator, j);
-                    sum.0 += (predicted - target) * (predicted - target);
-                    let distance = predicted - predict(self.last, j);
-                    sum.1 += distance * distance;
-                }
-            }
-            self.count += 1.0;
+    #[test]
+    fn sinh_is_an_eigenfunction_of_the_map() {
+        for x in [-3.0, -0.1, 0.0, 0.7, 5.0] {
+            let (after, before) = (libm::sinh(map(x) / 2.0), libm::sinh(x / 2.0));
+            assert!((after - EIGENVALUE * before).abs() <= 1e-12 * before.abs());
         }
     }
-    let sink = Test {
-        distinct: distinct_terms(structure.dictionary()),
-        dense: vec![0.0; structure.dictionary().dense_terms()],
-        dictionary: structure.dictionary().clone(),
-        outputs: (outputs, m),
-        last: &last.matrix,
-        operators: &operators,
-        sums: vec![(0.0, 0.0); samples.len()],
-        count: 0.0,
-    };
-    let mut pass = Snapshots::new(&structure, sink);
-    test.source().visit(&mut pass).map_err(FitError::Trajectories)?;
-    let Test { sums, count, .. } = pass.into_sink();
-    let mean = |pick: fn(&(f64, f64)) -> f64| {
-        let root = |sum| (pick(sum) / count).sqrt();
-        sums.iter().zip(&operators).map(|(s, o)| o.as_ref().map(|_| root(s))).collect()
-    };
-    Ok(Column { terms: last.terms, error: mean(|s| s.0), distance: mean(|s| s.1) })
 }

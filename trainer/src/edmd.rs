@@ -5,6 +5,7 @@
 use firmware_core::dictionary::{Dictionary, Source};
 use firmware_core::model::{ModelError, Provenance, Space, Structure};
 
+use crate::chain::Chain;
 use crate::gram::{GramAccumulator, NormalEquations};
 use crate::recording::{Summary, Visitor};
 use crate::robot::{FitOptions, Method, Robot, Scaling};
@@ -70,7 +71,7 @@ fn list(names: &[String]) -> String {
 /// The solution of one least-squares problem.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Operator {
-    /// F, shape `[terms, outputs]`, over the distinct terms in Hermite form.
+    /// F, shape `[terms, outputs]`, over the terms of the [`Lift`].
     pub matrix: Vec<f64>,
     /// Terms, n.
     pub terms: usize,
@@ -92,6 +93,55 @@ impl Operator {
     }
 }
 
+/// The terms that a fit is about: the distinct ones of a dictionary's blocks in Hermite form, or
+/// those of a chain in powers.
+#[derive(Clone, Debug)]
+pub struct Lift {
+    dictionary: Dictionary,
+    terms: Terms,
+    /// Scratch for all terms, those that are not fitted among them.
+    all: Vec<f64>,
+}
+
+#[derive(Clone, Debug)]
+enum Terms {
+    /// Dense indices.
+    Distinct(Vec<usize>),
+    Chain(Chain),
+}
+
+impl Lift {
+    /// The terms of a chain, or all distinct ones.
+    pub fn new(dictionary: &Dictionary, chain: Option<&Chain>) -> Self {
+        let (terms, all) = match chain {
+            None => (Terms::Distinct(distinct_terms(dictionary)), dictionary.dense_terms()),
+            Some(chain) => (Terms::Chain(chain.clone()), chain.fitted().len()),
+        };
+        Self { dictionary: dictionary.clone(), terms, all: vec![0.0; all] }
+    }
+
+    /// Number of terms.
+    pub fn count(&self) -> usize {
+        match &self.terms {
+            Terms::Distinct(distinct) => distinct.len(),
+            Terms::Chain(chain) => chain.count(),
+        }
+    }
+
+    /// The terms at the values of the observables, in `lifted`, shape `[count]`.
+    pub fn lift(&mut self, values: &[f64], lifted: &mut [f64]) {
+        match &self.terms {
+            Terms::Distinct(distinct) => {
+                self.dictionary.lift_dense(values, &mut self.all);
+                for (to, term) in lifted.iter_mut().zip(distinct) {
+                    *to = self.all[*term];
+                }
+            }
+            Terms::Chain(chain) => chain.lift(&self.dictionary, values, &mut self.all, lifted),
+        }
+    }
+}
+
 /// What a least-squares problem over snapshot pairs is summed into: memory does not grow with them.
 #[derive(Clone, Debug)]
 pub enum Regression {
@@ -99,13 +149,9 @@ pub enum Regression {
     Gram(Box<GramAccumulator>),
     /// The R factor, and a buffer for the lift.
     Qr {
-        /// Dictionary.
-        dictionary: Box<Dictionary>,
-        /// Dense indices of its distinct terms.
-        distinct: Vec<usize>,
-        /// Scratch for all terms.
-        dense: Vec<f64>,
-        /// Scratch for the distinct ones.
+        /// The terms.
+        lift: Box<Lift>,
+        /// Scratch for them.
         lifted: Vec<f64>,
         /// R so far.
         factor: RFactor,
@@ -115,19 +161,25 @@ pub enum Regression {
 }
 
 impl Regression {
-    /// An empty problem for `outputs` targets.
-    pub fn new(dictionary: &Dictionary, outputs: usize, method: Method) -> Self {
-        match method {
-            Method::Cholesky => Self::Gram(Box::new(GramAccumulator::new(dictionary, outputs))),
-            Method::Qr | Method::Svd => {
-                let distinct = distinct_terms(dictionary);
+    /// An empty problem for `outputs` targets. The terms of a chain go through the R factor whatever
+    /// the method says.
+    pub fn new(
+        dictionary: &Dictionary,
+        chain: Option<&Chain>,
+        outputs: usize,
+        method: Method,
+    ) -> Self {
+        match (method, chain) {
+            (Method::Cholesky, None) => {
+                Self::Gram(Box::new(GramAccumulator::new(dictionary, outputs)))
+            }
+            _ => {
+                let lift = Lift::new(dictionary, chain);
                 Self::Qr {
-                    dense: vec![0.0; dictionary.dense_terms()],
-                    lifted: vec![0.0; distinct.len()],
-                    factor: RFactor::new(distinct.len(), outputs),
+                    lifted: vec![0.0; lift.count()],
+                    factor: RFactor::new(lift.count(), outputs),
                     pairs: 0,
-                    dictionary: Box::new(dictionary.clone()),
-                    distinct,
+                    lift: Box::new(lift),
                 }
             }
         }
@@ -138,11 +190,8 @@ impl Regression {
     pub fn push(&mut self, values: &[f64], targets: &[f64]) {
         match self {
             Self::Gram(gram) => gram.push(values, targets),
-            Self::Qr { dictionary, distinct, dense, lifted, factor, pairs } => {
-                dictionary.lift_dense(values, dense);
-                for (to, term) in lifted.iter_mut().zip(distinct.iter()) {
-                    *to = dense[*term];
-                }
+            Self::Qr { lift, lifted, factor, pairs } => {
+                lift.lift(values, lifted);
                 factor.push(lifted, targets);
                 *pairs += 1;
             }
@@ -152,14 +201,13 @@ impl Regression {
     /// Solves it.
     ///
     /// # Errors
-    /// The indices of the distinct terms that depend on earlier ones, where the options do not
-    /// accept that.
+    /// The indices of the terms that depend on earlier ones, where the options do not accept that.
     pub fn solve(self, options: &FitOptions, outputs: usize) -> Result<Operator, Vec<usize>> {
         match self {
             Self::Gram(gram) => solve_normal(&gram.finish(), options),
-            Self::Qr { distinct, factor, pairs, .. } => {
+            Self::Qr { lifted, factor, pairs, .. } => {
                 let (r, c) = factor.finish();
-                solve_factor(r, c, distinct.len(), outputs, pairs, options)
+                solve_factor(r, c, lifted.len(), outputs, pairs, options)
             }
         }
     }
@@ -324,6 +372,8 @@ const ROUNDING_FLOOR: f64 = 1e-9;
 pub struct Fit<'r> {
     /// Spaces, symmetry, dictionary with its scaling, limits, provenance.
     pub structure: Structure<'r>,
+    /// The terms, where they are listed one by one.
+    pub chain: Option<&'r Chain>,
     /// F.
     pub operator: Operator,
     /// Smallest and largest raw value of every observable, shape `[observables, 2]`.
@@ -356,7 +406,8 @@ pub fn fit<'r, T: Trajectories>(
     };
     let structure =
         robot.structure(&scaling, &robot.limits(), provenance).map_err(FitError::Model)?;
-    let regression = Regression::new(structure.dictionary(), structure.outputs(), robot.fit.method);
+    let (dictionary, chain) = (structure.dictionary(), robot.chain.as_ref());
+    let regression = Regression::new(dictionary, chain, structure.outputs(), robot.fit.method);
     let sink = FitSink { regression, extremes: Extremes::new(scaling.len()), progress };
     let mut pass = FitPass {
         snapshots: Snapshots::new(&structure, sink),
@@ -386,7 +437,15 @@ pub fn fit<'r, T: Trajectories>(
     let provenance = Provenance { logs: summary.sha256, robot: robot.sha256 };
     let structure = robot.structure(&scaling, &limits, provenance).map_err(FitError::Model)?;
     let spread = coordinates.iter().map(Spread::deviation).collect();
-    Ok(Fit { structure, operator, ranges, example: example.take(), spread, summary })
+    Ok(Fit {
+        structure,
+        chain: robot.chain.as_ref(),
+        operator,
+        ranges,
+        example: example.take(),
+        spread,
+        summary,
+    })
 }
 
 /// Solves a regression, naming dependent terms by the robot's words.
@@ -412,13 +471,18 @@ pub(crate) fn rank_deficient<E>(
     dependent: &[usize],
 ) -> FitError<E> {
     let dictionary = structure.dictionary();
-    let distinct = distinct_terms(dictionary);
     let (states, inputs) = crate::terms::robot_names(robot);
     let names = crate::terms::Names { states: &states, inputs: &inputs };
-    let name = |i: &usize| names.term(dictionary, distinct[*i], crate::terms::Form::Hermite);
+    let terms = match &robot.chain {
+        Some(chain) => chain.names(dictionary, names),
+        None => distinct_terms(dictionary)
+            .iter()
+            .map(|i| names.term(dictionary, *i, crate::terms::Form::Hermite))
+            .collect(),
+    };
     FitError::RankDeficient {
-        terms: distinct.len(),
-        dependent: dependent.iter().map(name).collect(),
+        terms: terms.len(),
+        dependent: dependent.iter().map(|i| terms[*i].clone()).collect(),
     }
 }
 

@@ -33,6 +33,9 @@
 //! θ is trained in f32, K is solved for in f64. Sums have a fixed order and every operation is
 //! exactly rounded, as in [`gram`](crate::gram): the bits depend on the seed and the data, not on
 //! the machine.
+//!
+//! The network is our own: three matrix products and their gradients, in a fixed order of operations.
+//! The frameworks at hand bring dozens of crates and sums whose bits depend on the machine.
 
 use firmware_core::Scalar;
 use firmware_core::model::Space;
@@ -165,6 +168,10 @@ impl Baseline for EdmdDl {
 }
 
 impl Forecast for EdmdDl {
+    fn numbers(&self) -> usize {
+        self.network.theta.len() + self.change.len()
+    }
+
     /// s⁺ = s + Ψ(x, u) D_s; angles in (−π, π] by their sine and cosine.
     fn predict(&self, states: &[f64], inputs: &[f64], next: &mut [f64]) -> bool {
         let f = &self.features;

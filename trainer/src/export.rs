@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use firmware_core::blob::{self, EmitError};
 use firmware_core::capacity::{MAX_LAG, MAX_ORDER};
 use firmware_core::dictionary::{Basis, Dictionary, block_size};
-use firmware_core::model::{Model, ModelError, Space};
+use firmware_core::model::{Model, ModelError, Space, Structure};
 
+use crate::chain::Chain;
 use crate::edmd::{Fit, Operator};
 use crate::gram::hermite_powers;
 use crate::terms::distinct_terms;
@@ -70,9 +71,33 @@ fn to_powers(block: &mut [f64], radix: usize, after: usize) {
     }
 }
 
-/// The f32 coefficients of the blob.
-pub fn controller_coefficients(dictionary: &Dictionary, operator: &Operator) -> Vec<f32> {
-    monomial_coefficients(dictionary, operator).into_iter().map(|c| c as f32).collect()
+/// The f32 coefficients of the blob: of a dense model, or of the terms of a chain.
+pub fn controller_coefficients(
+    dictionary: &Dictionary,
+    chain: Option<&Chain>,
+    operator: &Operator,
+) -> Vec<f32> {
+    let coefficients = match chain {
+        Some(chain) => chain.spread(&operator.matrix, operator.outputs),
+        None => monomial_coefficients(dictionary, operator),
+    };
+    coefficients.into_iter().map(|c| c as f32).collect()
+}
+
+/// The model of a structure with the coefficients of [`controller_coefficients`].
+///
+/// # Errors
+/// [`ModelError`].
+pub fn controller_model<'m>(
+    structure: Structure<'m>,
+    chain: Option<&'m Chain>,
+    coefficients: &'m [f32],
+    ranges: Option<&'m [f32]>,
+) -> Result<Model<'m>, ModelError> {
+    match chain {
+        Some(chain) => Model::new_sparse(structure, chain.entries(), coefficients, ranges),
+        None => Model::new(structure, coefficients, ranges),
+    }
 }
 
 /// The blob of a fit.
@@ -81,8 +106,8 @@ pub fn controller_coefficients(dictionary: &Dictionary, operator: &Operator) -> 
 /// [`ExportError`]: infinite coefficients, or a model that diverges on its own example.
 pub fn export(fit: &Fit<'_>) -> Result<Vec<u8>, ExportError> {
     let structure = &fit.structure;
-    let coefficients = controller_coefficients(structure.dictionary(), &fit.operator);
-    let model = Model::new(structure.clone(), &coefficients, Some(&fit.ranges))
+    let coefficients = controller_coefficients(structure.dictionary(), fit.chain, &fit.operator);
+    let model = controller_model(structure.clone(), fit.chain, &coefficients, Some(&fit.ranges))
         .map_err(ExportError::Model)?;
     let (states, inputs) = &fit.example;
     let spaces: Vec<Space> = structure.states().iter().map(|s| s.space).collect();
@@ -106,7 +131,14 @@ pub fn export(fit: &Fit<'_>) -> Result<Vec<u8>, ExportError> {
     let names: usize =
         structure.states().iter().map(|s| s.name.len() + s.unit.len()).sum::<usize>()
             + structure.inputs().iter().map(|u| u.name.len() + u.unit.len()).sum::<usize>();
-    let mut bytes = vec![0; 4 * numbers + names + structure.robot().len() + 4096];
+    let mut bytes = vec![
+        0;
+        4 * numbers
+            + 2 * fit.chain.map_or(0, |c| c.entries().len())
+            + names
+            + structure.robot().len()
+            + 4096
+    ];
     let length = blob::emit(&model, &states, &inputs, &tolerance, &mut bytes)
         .map_err(ExportError::SelfTest)?;
     bytes.truncate(length);

@@ -1,7 +1,8 @@
 //! The paper's figures, drawn again from the results of [`reproduce`](crate::reproduce).
 
+use crate::convergence::Convergence;
 use crate::plot::{Axes, Chart, Series, Style, svg};
-use crate::reproduce::{Convergence, Method, Reproduction, TestResult};
+use crate::reproduce::{Method, Reproduction, TestResult};
 
 const BLACK: [u8; 3] = [0, 0, 0];
 const GREY: [u8; 3] = [170, 170, 170];
@@ -17,6 +18,7 @@ fn colour(method: Method) -> [u8; 3] {
         Method::SindyThresholded => [140, 86, 75],
         Method::AcdEdmd => BLUE,
         Method::AcdEdmdAveraged => [140, 180, 215],
+        Method::AcdEdmdWhole => [227, 119, 194],
         Method::Recommended => GREEN,
         Method::NoMotion => GREY,
         Method::Arx => [188, 189, 34],
@@ -96,9 +98,9 @@ pub fn all(results: &Reproduction) -> Vec<(&'static str, String)> {
         "horizon.svg",
         "Rollout error grows with the horizon",
         [
-            ("drive-euler/train", "drive-euler/validation", "drive, Euler: position", 2),
             ("drive-exact/train", "drive-exact/validation", "drive, exact motion: position", 2),
             ("drive-exact/train", "drive-exact/circle", "drive, exact motion, circle: position", 2),
+            ("rosbot/chattering", "rosbot/circle", "ROSbot, own logs, circle: position", 2),
             ("arm-euler/train", "arm-euler/validation", "arm, Euler: both angles", 2),
             ("arm-rk4/train", "arm-rk4/validation", "arm, RK4: both angles", 2),
             ("leg-walk/train", "leg-walk/test", "soft leg, walk: tip", 2),
@@ -110,7 +112,12 @@ pub fn all(results: &Reproduction) -> Vec<(&'static str, String)> {
         .collect(),
         3,
     );
-    add("convergence.svg", "Convergence of the estimate", converging(&results.convergence), 2);
+    add(
+        "convergence.svg",
+        "Convergence of the estimate to the Koopman operator",
+        converging(&results.convergence),
+        2,
+    );
     figures
 }
 
@@ -126,7 +133,7 @@ fn predictions(test: &TestResult) -> Vec<(&'static str, [u8; 3], Style, Vec<f64>
     let mut found = Vec::new();
     if let Some(evaluation) = test.score(Method::AcdEdmd).and_then(|s| s.evaluation.as_ref()) {
         let steps = from_start(&evaluation.example_steps);
-        found.push(("ACD-EDMD, one step ahead (as in the paper)", BLUE, Style::Points, steps));
+        found.push(("ACD-EDMD, one step ahead", BLUE, Style::Points, steps));
         found.push((
             "ACD-EDMD, rolled out from the start",
             RED,
@@ -249,10 +256,8 @@ fn leg(test: &TestResult) -> Chart {
             Some(series(name, [shade; 3], Style::Line, arc(tip)))
         })
         .collect();
-    if let Some((name, colour, style, x)) = predictions(test).into_iter().next() {
-        let points = x.chunks_exact(2).map(|x| (x[0], x[1])).collect();
-        all.push(series(name, colour, style, points));
-    }
+    let path = tips.iter().map(|tip| (tip[0], tip[1])).collect();
+    all.push(series("true", BLACK, Style::Dashed, path));
     Chart {
         title: "the leg on its way".to_owned(),
         x: label(test, 0),
@@ -304,11 +309,11 @@ fn converging(study: &Convergence) -> Vec<Option<Chart>> {
         }
     };
     vec![
-        Some(chart("error of one step on other data", "RMS displacement error [m]", &|i| {
-            study.columns[i].error.clone()
+        Some(chart("leading eigenvalue", "distance to the exact one", &|i| {
+            study.columns[i].eigenvalue_error.clone()
         })),
-        Some(chart("distance to the estimate from all samples", "RMS distance [m]", &|i| {
-            study.columns[i].distance.clone()
+        Some(chart("prediction of the next x", "RMS error", &|i| {
+            study.columns[i].prediction_error.clone()
         })),
     ]
 }

@@ -63,6 +63,9 @@ impl<'d> Data<'d> {
 
 /// Predicts the next sample of a robot from those before it.
 pub trait Forecast {
+    /// Numbers that the model consists of and that are not 0: what training has found.
+    fn numbers(&self) -> usize;
+
     /// Predicts `next`, shape `[states]`, from the samples up to the present one: `states`, shape
     /// `[samples, n]`, and `inputs`, shape `[samples, m]`, oldest first, the last input being the
     /// one that acts until the next sample. A method uses as many of them as it looks back, at least
@@ -75,10 +78,10 @@ pub trait Forecast {
     fn roll_out(&self, states: &[f64], inputs: &[f64], predicted: &mut [f64], n: usize) -> bool {
         let steps = predicted.len() / n.max(1);
         let past = states.len() / n.max(1);
-        let m = inputs.len() / (past - 1 + steps).max(1);
+        let m = inputs.len() / (past + steps).saturating_sub(1).max(1);
         let mut all = Vec::with_capacity(states.len() + predicted.len());
         all.extend_from_slice(states);
-        for (step, next) in predicted.chunks_exact_mut(n).enumerate() {
+        for (step, next) in predicted.chunks_exact_mut(n.max(1)).enumerate() {
             if !self.predict(&all, &inputs[..(past + step) * m], next) {
                 return false;
             }
@@ -127,8 +130,6 @@ pub struct Evaluation {
     pub by_step: Vec<f64>,
     /// Trajectories whose rollout diverged; then `rollout` is infinite.
     pub diverged: usize,
-    /// Trajectories scored.
-    pub trajectories: usize,
     /// One-step predictions of the first trajectory, shape `[samples − 1, states]`, for plots.
     pub example_steps: Vec<f64>,
     /// Rollout of the first trajectory, shape `[steps, states]`, for plots; empty if it diverged.
@@ -186,22 +187,14 @@ pub fn evaluate(method: &(impl Forecast + ?Sized), test: Data<'_>, steps: usize)
         *sum /= pairs as f64;
     }
     for sum in &mut by_step {
-        *sum /= rolled as f64;
+        *sum = if rolled > 0 { *sum / rolled as f64 } else { f64::INFINITY };
     }
     let mean = |i: usize| by_step[i..].iter().step_by(n).sum::<f64>() / steps as f64;
     let rollout = match diverged {
         0 => (0..n).map(mean).collect(),
         _ => vec![f64::INFINITY; n],
     };
-    Evaluation {
-        one_step,
-        rollout,
-        by_step,
-        diverged,
-        trajectories: test.trajectories.len(),
-        example_steps,
-        example,
-    }
+    Evaluation { one_step, rollout, by_step, diverged, example_steps, example }
 }
 
 /// The prediction that nothing moves.
@@ -209,6 +202,10 @@ pub fn evaluate(method: &(impl Forecast + ?Sized), test: Data<'_>, steps: usize)
 pub struct NoMotion;
 
 impl Forecast for NoMotion {
+    fn numbers(&self) -> usize {
+        0
+    }
+
     fn predict(&self, states: &[f64], _: &[f64], next: &mut [f64]) -> bool {
         next.copy_from_slice(&states[states.len() - next.len()..]);
         true
@@ -223,6 +220,10 @@ mod tests {
     struct Doubling;
 
     impl Forecast for Doubling {
+        fn numbers(&self) -> usize {
+            2
+        }
+
         fn predict(&self, states: &[f64], inputs: &[f64], next: &mut [f64]) -> bool {
             next[0] = 2.0 * states[states.len() - 1] + inputs[inputs.len() - 1];
             next[0] < 1e3
@@ -251,7 +252,7 @@ mod tests {
         assert_eq!(result.example, [3.0, 7.0]);
         assert_eq!(result.by_step, [0.0, 1.0]);
         assert_eq!(result.rollout, [0.5]);
-        assert_eq!((result.trajectories, result.diverged), (1, 0));
+        assert_eq!(result.diverged, 0);
     }
 
     #[test]

@@ -26,6 +26,15 @@ pub enum FullOperatorError<E> {
     /// The least-squares problem has no solution.
     #[error(transparent)]
     Fit(#[from] FitError<E>),
+    /// The dictionary lists its terms one by one.
+    #[error(
+        "{robot} has no spectrum: `[dictionary] terms` lists the terms of its equations, which need \
+         not be a space of functions that the operator acts on; give blocks instead"
+    )]
+    Listed {
+        /// The robot.
+        robot: String,
+    },
     /// The dictionary has no function of the state but the constant, whose eigenvalue is 1.
     #[error(
         "{robot} has no spectrum: the constant is the only term of its dictionary without inputs{}",
@@ -127,6 +136,9 @@ impl<'r> FullOperator<'r> {
         trajectories: &T,
         progress: &dyn Fn(u64),
     ) -> Result<Self, FullOperatorError<T::Error>> {
+        if robot.chain.is_some() {
+            return Err(FullOperatorError::Listed { robot: robot.name.clone() });
+        }
         let provenance = Provenance { logs: [0; 32], robot: robot.sha256 };
         let structure = |scaling: &[[f32; 2]]| {
             robot.structure(scaling, &robot.limits(), provenance).map_err(FitError::Model)
@@ -149,7 +161,7 @@ impl<'r> FullOperator<'r> {
         let dictionary = structure.dictionary();
         let mut pass = Pass {
             structure: &structure,
-            regression: Regression::new(dictionary, n, robot.fit.method),
+            regression: Regression::new(dictionary, None, n, robot.fit.method),
             dense: &dense,
             history: History::default(),
             next: structure.sample(&[]),

@@ -50,6 +50,10 @@ impl Default for Settings {
 pub struct Hermite(Koopman);
 
 impl Forecast for Hermite {
+    fn numbers(&self) -> usize {
+        self.0.numbers()
+    }
+
     fn predict(&self, states: &[f64], inputs: &[f64], next: &mut [f64]) -> bool {
         self.0.predict(states, inputs, next)
     }
@@ -77,6 +81,7 @@ impl Baseline for Hermite {
             factors: (0..observables.len()).map(factor).collect(),
             blocks: vec![Block { factors: 1, max_degree: 0 }; observables.len()],
             observables,
+            chain: None,
             standardise: false,
             // An input that never moves is no reason to fail.
             fit: FitOptions { method: Method::Svd, ..Default::default() },

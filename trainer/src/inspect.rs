@@ -207,11 +207,18 @@ fn describe(model: &Model<'_>, test: &SelfTest<'_>, bytes: usize) -> Inspection 
     let names = Names { states: &states, inputs: &inputs };
     let finite = |x: f32| x.is_finite().then_some(x);
     let eigenvalues = spectrum::eigenvalues(model, test.states, test.inputs).unwrap_or_default();
-    let dense = dictionary.dense_terms();
-    let term_names: Vec<String> =
-        (0..dense).map(|i| names.term(dictionary, i, Form::Monomial)).collect();
-    let equations =
-        output_names(structure).into_iter().zip(model.coefficients().chunks_exact(dense.max(1)));
+    let per_output = model.coefficients_per_output();
+    let term_names: Vec<String> = match model.terms() {
+        Some(terms) => (0..per_output).map(|i| names.sparse_term(dictionary, terms, i)).collect(),
+        None => (0..per_output).map(|i| names.term(dictionary, i, Form::Monomial)).collect(),
+    };
+    let distinct = match model.terms() {
+        Some(_) => term_names.clone(),
+        None => distinct_terms(dictionary).into_iter().map(|i| term_names[i].clone()).collect(),
+    };
+    let equations = output_names(structure)
+        .into_iter()
+        .zip(model.coefficients().chunks_exact(per_output.max(1)));
     let provenance = structure.provenance();
     Inspection {
         robot: structure.robot().to_owned(),
@@ -253,7 +260,7 @@ fn describe(model: &Model<'_>, test: &SelfTest<'_>, bytes: usize) -> Inspection 
                 range: model.ranges().and_then(|r| r.get(2 * i..)?.first_chunk().copied()),
             })
             .collect(),
-        terms: distinct_terms(dictionary).into_iter().map(|i| term_names[i].clone()).collect(),
+        terms: distinct,
         equations: equations
             .map(|(output, row)| {
                 let mut terms: Vec<(String, f32)> = Vec::new();

@@ -1,11 +1,11 @@
 //! A Koopman operator with any dictionary of robot.toml as a [`Forecast`]: what `trainer fit`
 //! learns and the controller's own f32 predictor, without the way through a blob.
 
-use firmware_core::model::{Model, Provenance, Structure};
+use firmware_core::model::{Provenance, Structure};
 use firmware_core::{Predictor, PredictorState};
 
 use crate::edmd::{self, FitError, Operator, Regression};
-use crate::export::{controller_coefficients, coordinate};
+use crate::export::{controller_coefficients, controller_model, coordinate};
 use crate::forecast::{Data, Forecast};
 use crate::robot::{FitOptions, Method, Robot, Scaling};
 use crate::snapshots::{PairSink, Snapshots};
@@ -54,10 +54,11 @@ impl Koopman {
         let scaling = robot.identity_scaling();
         let structure =
             robot.structure(&scaling, &robot.limits(), provenance).map_err(FitError::Model)?;
+        let dictionary = structure.dictionary();
         let mut mean: Option<Operator> = None;
         for trajectory in training.trajectories {
             let empty =
-                Regression::new(structure.dictionary(), structure.outputs(), robot.fit.method);
+                Regression::new(dictionary, robot.chain.as_ref(), structure.outputs(), fit.method);
             let mut snapshots = Snapshots::new(&structure, Sink(empty));
             let trajectories = std::slice::from_ref(trajectory);
             Data { trajectories, ..training }
@@ -88,17 +89,20 @@ impl Koopman {
             robot: robot.clone(),
             scaling: observables.iter().map(|o| [o.centre, o.gain]).collect(),
             limits: structure.states().iter().map(|s| s.limit).collect(),
-            coefficients: controller_coefficients(structure.dictionary(), operator),
+            coefficients: controller_coefficients(
+                structure.dictionary(),
+                robot.chain.as_ref(),
+                operator,
+            ),
         }
-    }
-
-    /// Number of coefficients.
-    pub fn coefficients(&self) -> usize {
-        self.coefficients.len()
     }
 }
 
 impl Forecast for Koopman {
+    fn numbers(&self) -> usize {
+        self.coefficients.iter().filter(|c| **c != 0.0).count()
+    }
+
     fn predict(&self, states: &[f64], inputs: &[f64], next: &mut [f64]) -> bool {
         let n = next.len();
         self.roll_out(states, inputs, next, n)
@@ -112,7 +116,10 @@ impl Forecast for Koopman {
         let Ok(structure) = self.robot.structure(&self.scaling, &self.limits, provenance) else {
             return false;
         };
-        let Ok(model) = Model::new(structure, &self.coefficients, None) else { return false };
+        let chain = self.robot.chain.as_ref();
+        let Ok(model) = controller_model(structure, chain, &self.coefficients, None) else {
+            return false;
+        };
         let structure = model.structure();
         let narrow = |row: &[f64]| -> Vec<f32> {
             row.iter().zip(structure.states()).map(|(x, s)| coordinate(*x, s.space)).collect()

@@ -6,6 +6,7 @@
 //! | [`recording`], [`trajectory`] | logs, streamed with errors that name file, row and column; trajectories |
 //! | [`snapshots`] | snapshot pairs, made by the core's own lift |
 //! | [`gram`], [`solve`], [`edmd`] | the least-squares problem in constant memory |
+//! | [`chain`] | dictionaries that list their terms one by one |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
 //! | [`score`], [`arx`] | rollouts over windows beside no motion and a linear ARX |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
@@ -16,6 +17,7 @@
 //! | [`resample`] | logs on a regular time grid |
 
 pub mod arx;
+pub mod chain;
 pub mod convergence;
 pub mod edmd;
 pub mod edmd_dl;
@@ -27,6 +29,8 @@ pub mod gram;
 pub mod hermite;
 pub mod inspect;
 pub mod koopman;
+mod paper;
+mod paper_report;
 pub mod plot;
 pub mod recording;
 pub mod report;

@@ -11,13 +11,13 @@ use firmware_core::model::{Model, Space, Structure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use trainer::edmd;
-use trainer::export::{export, write_whole};
+use trainer::export::{controller_coefficients, export, write_whole};
 use trainer::figures;
 use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
 use trainer::recording::{LogColumn, LogSchema, Recording};
 use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
-use trainer::reproduce::{self, Method as PaperMethod};
+use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
 use trainer::robot::{Method, Robot, ScoreOptions};
 use trainer::score::{self, Counts, Lifted};
@@ -320,7 +320,7 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
         let counts =
             Counts { trajectories: fitted.summary.trajectories, rows: fitted.summary.rows };
         let scoring = bar("scoring", recording.bytes());
-        let lifted = Lifted::Fitted(&fitted.structure, &robot.fit);
+        let lifted = Lifted::Fitted(&fitted.structure, fitted.chain, &robot.fit);
         let scored =
             score::score(&source, counts, lifted, &robot.score, None, &|b| scoring.set_position(b));
         scoring.finish_and_clear();
@@ -339,7 +339,7 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
     write_whole(&out, |file| file.write_all(&bytes))?;
 
     let coefficients =
-        trainer::export::controller_coefficients(fitted.structure.dictionary(), &fitted.operator);
+        controller_coefficients(fitted.structure.dictionary(), fitted.chain, &fitted.operator);
     let options = robot.fit;
     let provenance = fitted.structure.provenance();
     let report = FitReport {
@@ -827,6 +827,25 @@ fn reproduce_paper(args: &ReproduceArgs) -> Result<(), Failure> {
     if out.exists() && !out.is_dir() {
         return Err(Failure(format!("{}: not a folder; give another --out", out.display())));
     }
+    let file = out.join("report.md");
+    let own = |text: String| text.starts_with(Reproduction::HEADING);
+    if file.exists() && !std::fs::read_to_string(&file).is_ok_and(own) {
+        return Err(Failure(format!(
+            "{}: not a report of `trainer reproduce`; give another --out",
+            file.display()
+        )));
+    }
+    let (logs, target) = (args.dir.canonicalize(), std::path::absolute(out));
+    if let (Ok(logs), Ok(target)) = (logs, target)
+        && target.starts_with(logs)
+    {
+        return Err(Failure(format!(
+            "{}: among the logs, which are to stay as they were recorded; give another --out",
+            out.display()
+        )));
+    }
+    let is_new = !out.exists();
+    std::fs::create_dir_all(out).map_err(|e| format!("{}: cannot be made: {e}", out.display()))?;
     let mut methods = PaperMethod::ALL.to_vec();
     methods.retain(|m| !(args.quick && *m == PaperMethod::EdmdDl));
     let bar = ProgressBar::new(1);
@@ -840,8 +859,11 @@ fn reproduce_paper(args: &ReproduceArgs) -> Result<(), Failure> {
         bar.set_message(next.to_owned());
     });
     bar.finish_and_clear();
+    if results.is_err() && is_new {
+        // Nothing is in it yet; a folder that will not go is no further news.
+        let _ = std::fs::remove_dir(out);
+    }
     let results = results?;
-    std::fs::create_dir_all(out).map_err(|e| format!("{}: cannot be made: {e}", out.display()))?;
     let mut report = results.text();
     let mut links = String::from("\n## Figures\n\n");
     for (name, svg) in figures::all(&results) {
@@ -849,7 +871,6 @@ fn reproduce_paper(args: &ReproduceArgs) -> Result<(), Failure> {
         links += &format!("![{name}]({name})\n");
     }
     report += &format!("\n{}", results.times());
-    let file = out.join("report.md");
     let whole = format!("{report}{links}");
     write_whole(&file, |file| file.write_all(whole.as_bytes()))?;
     if args.json {

@@ -12,6 +12,7 @@ use firmware_core::model::{
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
+use crate::chain::Chain;
 use crate::recording::{LogColumn, LogSchema};
 
 /// Why a robot description is refused.
@@ -141,6 +142,7 @@ struct DictionaryToml {
     fourier: BTreeMap<String, u8>,
     delays: DelaysToml,
     blocks: Vec<BlockToml>,
+    terms: Vec<String>,
     max_degree: u8,
     standardise: bool,
 }
@@ -153,6 +155,7 @@ impl Default for DictionaryToml {
             fourier: BTreeMap::new(),
             delays: DelaysToml::default(),
             blocks: Vec::new(),
+            terms: Vec::new(),
             max_degree: 0,
             standardise: true,
         }
@@ -276,6 +279,9 @@ pub struct Robot {
     pub factors: Vec<Factor>,
     /// Kronecker blocks.
     pub blocks: Vec<Block>,
+    /// The terms, where the description lists them one by one: products of the functions of the
+    /// blocks, which are single factors then.
+    pub chain: Option<Chain>,
     /// Centre and scale the observables on ℝ by the mean and standard deviation of the data.
     pub standardise: bool,
     /// How to fit.
@@ -488,7 +494,13 @@ impl Robot {
             factors: Vec::new(),
             blocks: Vec::new(),
         };
-        parts.build(&toml.dictionary)?;
+        let chain = match toml.dictionary.terms.is_empty() {
+            true => {
+                parts.build(&toml.dictionary)?;
+                None
+            }
+            false => Some(parts.build_terms(&toml.dictionary)?),
+        };
         let DictionaryParts { observables, factors, blocks, .. } = parts;
         let robot = Self {
             name: toml.name,
@@ -499,6 +511,7 @@ impl Robot {
             observables,
             factors,
             blocks,
+            chain,
             standardise: toml.dictionary.standardise,
             fit: toml.fit,
             score: toml.score,
@@ -622,6 +635,42 @@ fn explain(error: &ModelError, robot: &Robot) -> String {
     }
 }
 
+/// A function in a listed term.
+#[derive(Clone, Copy, Debug)]
+enum Function {
+    /// A power of an observable.
+    Power { source: Source, lag: u8, power: u8 },
+    /// sin or cos of n times an angle; `source` is its sine.
+    Harmonic { source: Source, lag: u8, n: u8, cosine: bool },
+}
+
+impl Function {
+    /// The factor that provides it, and the order that the factor needs.
+    fn factor(self) -> (Source, u8, Basis, u8) {
+        match self {
+            Self::Power { source, lag, power } => (source, lag, Basis::Hermite, power),
+            Self::Harmonic { source, lag, n, .. } => (source, lag, Basis::Fourier, n),
+        }
+    }
+
+    /// Its number within the factor, from 1 on.
+    fn digit(self) -> usize {
+        match self {
+            Self::Power { power, .. } => power.into(),
+            Self::Harmonic { n, cosine, .. } => 2 * usize::from(n) - usize::from(!cosine),
+        }
+    }
+}
+
+/// The factors of a product: split at each `*` outside of parentheses.
+fn split_product(text: &str) -> impl Iterator<Item = &str> {
+    let mut depth = 0;
+    text.split(move |c| {
+        depth += i32::from(c == '(') - i32::from(c == ')');
+        c == '*' && depth == 0
+    })
+}
+
 /// Collects observables, factors and blocks.
 struct DictionaryParts<'r> {
     states: &'r [RobotState],
@@ -685,6 +734,115 @@ impl DictionaryParts<'_> {
             }
         }
         Ok(())
+    }
+
+    /// The functions that the listed terms are products of, each observable's a block of its own,
+    /// and the chain of the terms.
+    fn build_terms(&mut self, toml: &DictionaryToml) -> Result<Chain, (String, String)> {
+        let default = DictionaryToml::default();
+        let others = [
+            ("order", toml.order != default.order),
+            ("orders", !toml.orders.is_empty()),
+            ("fourier", !toml.fourier.is_empty()),
+            ("delays", toml.delays.states > 0 || toml.delays.inputs > 0),
+            ("blocks", !toml.blocks.is_empty()),
+            ("max_degree", toml.max_degree > 0),
+        ];
+        if let Some((name, _)) = others.iter().find(|(_, given)| *given) {
+            let message = "has no meaning beside `terms`, which list the whole dictionary";
+            return Err((format!("dictionary.{name}"), message.to_owned()));
+        }
+        let mut terms: Vec<Vec<Function>> = Vec::new();
+        for (t, text) in toml.terms.iter().enumerate() {
+            let fail = |message| (format!("dictionary.terms[{t}]"), message);
+            let functions: Result<Vec<Function>, String> =
+                split_product(text).map(|part| self.parse_function(part)).collect();
+            let functions = functions.map_err(fail)?;
+            terms.push(functions);
+        }
+        // One polynomial factor per observable and one Fourier factor per angle and lag, as high as
+        // the terms need them.
+        let mut factors: Vec<(Source, u8, Basis, u8)> = Vec::new();
+        for function in terms.iter().flatten() {
+            let (source, lag, basis, degree) = function.factor();
+            match factors.iter_mut().find(|f| (f.0, f.1, f.2) == (source, lag, basis)) {
+                Some(found) => found.3 = found.3.max(degree),
+                None => factors.push((source, lag, basis, degree)),
+            }
+        }
+        let mut first = Vec::new();
+        let mut functions = 0;
+        for (source, lag, basis, degree) in &factors {
+            self.factor(*source, *lag, *basis, *degree);
+            self.close_block(1, 0);
+            first.push(functions);
+            functions += match basis {
+                Basis::Hermite => usize::from(*degree),
+                Basis::Fourier => 2 * usize::from(*degree),
+            };
+        }
+        let index = |function: &Function| {
+            let (source, lag, basis, _) = function.factor();
+            let factor = factors.iter().position(|f| (f.0, f.1, f.2) == (source, lag, basis));
+            let index = factor.map_or(0, |f| first[f]) + function.digit() - 1;
+            u8::try_from(index).unwrap_or(u8::MAX)
+        };
+        let mut products: Vec<Vec<u8>> = Vec::new();
+        for (t, term) in terms.iter().enumerate() {
+            let mut product: Vec<u8> = term.iter().map(index).collect();
+            product.sort_unstable();
+            if products.contains(&product) {
+                let message = format!("`{}` is listed twice", toml.terms[t]);
+                return Err((format!("dictionary.terms[{t}]"), message));
+            }
+            products.push(product);
+        }
+        let full = || {
+            let message = format!(
+                "more terms, or functions in them, than the controller has room for ({} and {})",
+                firmware_core::capacity::MAX_SPARSE_TERMS,
+                firmware_core::capacity::MAX_FUNCTIONS
+            );
+            ("dictionary.terms".to_owned(), message)
+        };
+        if functions > firmware_core::capacity::MAX_FUNCTIONS {
+            return Err(full());
+        }
+        Chain::new(&products).ok_or_else(full)
+    }
+
+    /// `x^2`, `u@1`, `d(x)@1^3`, `sin(phi)`, `cos(3*phi)@1`.
+    fn parse_function(&self, text: &str) -> Result<Function, String> {
+        let text = text.trim();
+        let harmonic = |function: &str| {
+            let (inside, behind) =
+                text.strip_prefix(function)?.strip_prefix('(')?.split_once(')')?;
+            let (n, name) = inside.split_once('*')?;
+            Some((n.trim().parse::<u8>().ok()?, name.trim(), behind.trim()))
+        };
+        for (function, cosine) in [("sin", false), ("cos", true)] {
+            let Some((n, name, behind)) = harmonic(function) else { continue };
+            let (source, lag, _, order) = self.parse_factor(&format!("sin({name}){behind}"))?;
+            if n == 0 || n > firmware_core::capacity::MAX_ORDER || order != 1 {
+                return Err(format!(
+                    "`{text}`: expected a harmonic of 1 to {} without an exponent",
+                    firmware_core::capacity::MAX_ORDER
+                ));
+            }
+            return Ok(Function::Harmonic { source, lag, n, cosine });
+        }
+        match self.parse_factor(text)? {
+            (_, _, Basis::Fourier, _) => {
+                Err(format!("`{text}`: a term is made of sin(n*angle) and cos(n*angle)"))
+            }
+            (_, _, _, power) if power == 0 || power > firmware_core::capacity::MAX_ORDER => {
+                Err(format!(
+                    "`{text}`: expected an exponent of 1 to {}",
+                    firmware_core::capacity::MAX_ORDER
+                ))
+            }
+            (source, lag, Basis::Hermite, power) => Ok(Function::Power { source, lag, power }),
+        }
     }
 
     /// The paper's dictionary: one block that holds everything.

@@ -13,6 +13,7 @@ use firmware_core::model::{Model, Space, Structure};
 use firmware_core::{Predictor, PredictorState, Scalar};
 
 use crate::arx::{Arx, ArxAccumulator, MAX_LAGS};
+use crate::chain::Chain;
 use crate::edmd::{Operator, Regression, Spread};
 use crate::export::{controller_coefficients, coordinate};
 use crate::recording::Visitor;
@@ -238,6 +239,7 @@ pub struct Score {
 #[derive(Clone, Debug)]
 struct FoldModel<'a> {
     structure: Structure<'a>,
+    chain: Option<Vec<[u8; 2]>>,
     coefficients: Vec<f32>,
 }
 
@@ -252,7 +254,7 @@ struct Fold<'a> {
 #[derive(Clone, Copy, Debug)]
 pub enum Lifted<'l, 'a> {
     /// It is fitted in every fold, with the scaling of the structure.
-    Fitted(&'l Structure<'a>, &'l FitOptions),
+    Fitted(&'l Structure<'a>, Option<&'l Chain>, &'l FitOptions),
     /// It is the same in every fold: the blob under test.
     Given(&'l Model<'a>),
 }
@@ -260,7 +262,7 @@ pub enum Lifted<'l, 'a> {
 impl<'l, 'a> Lifted<'l, 'a> {
     fn structure(&self) -> &'l Structure<'a> {
         match self {
-            Self::Fitted(structure, _) => structure,
+            Self::Fitted(structure, ..) => structure,
             Self::Given(model) => model.structure(),
         }
     }
@@ -475,8 +477,8 @@ fn train<'a, T: Trajectories>(
     let structure = lifted.structure();
     let (n, m) = (structure.states().len(), structure.inputs().len());
     let regression = |_| match lifted {
-        Lifted::Fitted(s, options) if with_model => {
-            Some(Regression::new(s.dictionary(), s.outputs(), options.method))
+        Lifted::Fitted(s, chain, options) if with_model => {
+            Some(Regression::new(s.dictionary(), chain, s.outputs(), options.method))
         }
         _ => None,
     };
@@ -494,16 +496,21 @@ fn train<'a, T: Trajectories>(
     for (fold, (regression, arx)) in regressions.into_iter().zip(pass.arx).enumerate() {
         let untrained = ScoreError::Untrained { fold };
         let model = match (lifted, regression) {
-            (Lifted::Fitted(structure, options), Some(regression)) => {
+            (Lifted::Fitted(structure, chain, options), Some(regression)) => {
                 let solved = regression.solve(options, structure.outputs());
                 let Ok(operator @ Operator { pairs: 1.., .. }) = solved else {
                     return Err(untrained);
                 };
-                let coefficients = controller_coefficients(structure.dictionary(), &operator);
-                Some(FoldModel { structure: structure.clone(), coefficients })
+                let dictionary = structure.dictionary();
+                Some(FoldModel {
+                    structure: structure.clone(),
+                    chain: chain.map(|c| c.entries().to_vec()),
+                    coefficients: controller_coefficients(dictionary, chain, &operator),
+                })
             }
             (Lifted::Given(model), _) if with_model => Some(FoldModel {
                 structure: model.structure().clone(),
+                chain: model.terms().map(|terms| terms.entries().to_vec()),
                 coefficients: model.coefficients().to_vec(),
             }),
             _ => None,
@@ -599,7 +606,11 @@ fn run<T: Trajectories>(
     let models = task.folds.iter().map(|fold| {
         let model = fold.model.as_ref()?;
         // Coefficients beyond f32 make no model: its windows count as diverged.
-        Model::new(model.structure.clone(), &model.coefficients, None).ok()
+        let structure = model.structure.clone();
+        match &model.chain {
+            Some(chain) => Model::new_sparse(structure, chain, &model.coefficients, None).ok(),
+            None => Model::new(structure, &model.coefficients, None).ok(),
+        }
     });
     if let Some(out) = predictions.as_mut() {
         let names =

@@ -210,6 +210,10 @@ impl Sindy {
 }
 
 impl Forecast for Sindy {
+    fn numbers(&self) -> usize {
+        self.nonzeros().iter().sum()
+    }
+
     fn predict(&self, states: &[f64], inputs: &[f64], next: &mut [f64]) -> bool {
         let n = self.paths.len();
         let mut variables = Vec::with_capacity(self.library.variables);

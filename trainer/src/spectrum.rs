@@ -541,7 +541,11 @@ pub fn eigenvalues(
     inputs: &[f32],
 ) -> Result<Vec<(f64, f64)>, ModelError> {
     let coefficients: Vec<f64> = model.coefficients().iter().copied().map(f64::from).collect();
-    let model = Model::new(model.structure().clone(), &coefficients, None)?;
+    let structure = model.structure().clone();
+    let model = match model.terms() {
+        Some(terms) => Model::new_sparse(structure, terms.entries(), &coefficients, None)?,
+        None => Model::new(structure, &coefficients, None)?,
+    };
     let structure = model.structure();
     let (n, m) = (structure.states().len(), structure.inputs().len());
     let states: Vec<f64> = states.iter().copied().map(f64::from).collect();
@@ -591,7 +595,7 @@ pub fn eigenvalues(
 /// assert_eq!(trainer::spectrum::radius(&[(0.6, 0.8), (-0.5, 0.0)]), Some(1.0));
 /// ```
 pub fn radius(eigenvalues: &[(f64, f64)]) -> Option<f64> {
-    eigenvalues.iter().map(|(re, im)| re.hypot(*im)).reduce(f64::max)
+    eigenvalues.iter().map(|(re, im)| libm::hypot(*re, *im)).reduce(f64::max)
 }
 
 #[cfg(test)]

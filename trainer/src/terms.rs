@@ -1,6 +1,7 @@
 //! Readable names of observables, terms and dictionaries.
 
 use firmware_core::dictionary::{Basis, Dictionary, Factor, Source};
+use firmware_core::sparse::SparseTerms;
 
 use crate::robot::Robot;
 
@@ -74,6 +75,29 @@ impl Names<'_> {
             .map(|(factor, digit)| self.function(dictionary, *factor, *digit, form))
             .collect();
         functions.join("*")
+    }
+}
+
+impl Names<'_> {
+    /// A term of a sparse model, such as `v*omega@1^2*sin(2*phi)`; `1` for the constant.
+    pub fn sparse_term(
+        &self,
+        dictionary: &Dictionary,
+        terms: SparseTerms<'_>,
+        index: usize,
+    ) -> String {
+        let Some(powers) = terms.term(dictionary, index) else { return "?".to_owned() };
+        let function = |power: &firmware_core::sparse::Power| {
+            let name = self.function(dictionary, power.factor, power.digit, Form::Monomial);
+            match power.exponent {
+                1 => name,
+                exponent => format!("{name}^{exponent}"),
+            }
+        };
+        match powers.is_empty() {
+            true => "1".to_owned(),
+            false => powers.iter().map(function).collect::<Vec<_>>().join("*"),
+        }
     }
 }
 

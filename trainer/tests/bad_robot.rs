@@ -147,6 +147,38 @@ fn dictionaries() {
 }
 
 #[test]
+fn listed_terms() {
+    let terms = |list: &str, fragments: &[&str]| {
+        dictionary_refused(&format!("terms = [{list}]"), fragments);
+    };
+    let at = "dictionary.terms[1]";
+    terms("\"x\", \"y*u\"", &[at, "`y`", "neither a state nor an input"]);
+    terms("\"x\", \"phi*u\"", &[at, "lives on S1"]);
+    terms("\"x\", \"sin(0*phi)\"", &[at, "harmonic of 1 to 9"]);
+    terms("\"x\", \"cos(2*phi)^2\"", &[at, "without an exponent"]);
+    terms("\"x\", \"fourier(phi)^2\"", &[at, "sin(n*angle)"]);
+    terms("\"x\", \"u^10\"", &[at, "exponent of 1 to 9"]);
+    terms("\"x\", \"\"", &[at, "neither a state nor an input"]);
+    terms("\"x\", \"d(x)\"", &[at, "lag of 1 or more"]);
+    terms("\"x*u\", \"u*x\"", &[at, "`u*x` is listed twice"]);
+    terms("\"x@7\"", &["dictionary", "x@7", "6"]);
+    dictionary_refused("terms = [\"x\"]\norder = 2", &["dictionary.order", "beside `terms`"]);
+    dictionary_refused(
+        "terms = [\"x\"]\nblocks = [{ factors = [\"u\"] }]",
+        &["dictionary.blocks", "beside `terms`"],
+    );
+    // Nine powers of each of nine functions, in pairs: more than 255 products.
+    let powers = ["x", "u", "x@1", "u@1"];
+    let mut pairs = Vec::new();
+    for (i, a) in powers.iter().enumerate() {
+        for b in &powers[i + 1..] {
+            pairs.extend((1..8).flat_map(|p| (1..8).map(move |q| format!("\"{a}^{p}*{b}^{q}\""))));
+        }
+    }
+    terms(&pairs.join(", "), &["dictionary.terms", "255"]);
+}
+
+#[test]
 fn too_many_states() {
     let workshop = Workshop::new();
     let mut robot = "name = \"worm\"\nsample_time_s = 0.1\n".to_owned();

@@ -554,8 +554,45 @@ fn reproduce_wants_the_papers_logs() {
     assert!(message.contains("paper.toml: cannot be read"), "{message}");
     assert!(message.contains("`firmware-sim record paper --out DIR`"), "{message}");
     workshop.write("paper.toml", "seed = 1\nlogs = 3\n");
-    let message = workshop.refuse(&["reproduce", ".", "--out", "report"]);
+    workshop.write("paper/paper.toml", "seed = 1\nlogs = 3\n");
+    let message = workshop.refuse(&["reproduce", "paper", "--out", "report"]);
     assert!(message.contains("paper.toml: invalid type"), "{message}");
     let message = workshop.refuse(&["reproduce", ".", "--out", "robot.toml"]);
     assert!(message.contains("robot.toml: not a folder"), "{message}");
+    let message = workshop.refuse(&["reproduce", ".", "--out", "report"]);
+    assert!(message.contains("among the logs"), "{message}");
+    workshop.write("mine/report.md", "my own report\n");
+    let message = workshop.refuse(&["reproduce", "logs", "--out", "mine"]);
+    assert!(message.contains("not a report of `trainer reproduce`"), "{message}");
+}
+
+#[test]
+fn listed_terms_make_a_sparse_model() {
+    let workshop = Workshop::new();
+    let listed = r#"[dictionary]
+terms = ["u", "sin(phi)", "x", "x*sin(2*phi)*u"]
+standardise = false
+
+[score]"#;
+    workshop.describe("[score]", listed);
+    let fitted = workshop.succeed(&["fit", "."]);
+    assert!(fitted.contains("dictionary: 5 terms, 3 outputs"), "{fitted}");
+    let inspected = workshop.succeed(&["inspect", "model.bin", "--json"]);
+    let inspected: Value = serde_json::from_str(&inspected).unwrap();
+    // The chain needs a product of two for the product of three.
+    assert_eq!(inspected["terms"].as_array().unwrap().len(), 6);
+    let next_x = inspected["equations"][0]["terms"].as_array().unwrap();
+    let coefficient = |name: &str| {
+        let term = next_x.iter().find(|t| t[0] == name);
+        term.map_or(0.0, |t| t[1].as_f64().unwrap())
+    };
+    for (name, expected) in [("x", 0.9), ("sin(phi)", 0.1), ("u", 0.02), ("1", 0.0)] {
+        assert!((coefficient(name) - expected).abs() < 1e-6, "{name}: {next_x:?}");
+    }
+    assert!(next_x.iter().all(|t| t[0] != "x*sin(2*phi)*u" || t[1].as_f64().unwrap().abs() < 1e-6));
+    // The blob predicts as the fit did.
+    let scored = workshop.succeed(&["evaluate", "model.bin", "--logs", "logs"]);
+    assert!(scored.contains("x [m]"), "{scored}");
+    let message = workshop.refuse(&["spectrum", "."]);
+    assert!(message.contains("cart has no spectrum") && message.contains("blocks"), "{message}");
 }
