@@ -36,6 +36,8 @@ pub struct Inspection {
     pub terms: Vec<String>,
     /// One per output, largest coefficient first.
     pub equations: Vec<EquationInspection>,
+    /// Error bounds, if the blob has any.
+    pub error_bounds: Option<BoundsInspection>,
     /// Bytes of the blob.
     pub bytes: usize,
     /// Bytes of the coefficients among them.
@@ -48,6 +50,19 @@ pub struct Inspection {
     pub spectral_radius: Option<f64>,
     /// The eigenvalues, as \[real, imaginary\].
     pub eigenvalues: Vec<(f64, f64)>,
+}
+
+/// The error bounds of a blob.
+#[derive(Debug, Serialize)]
+pub struct BoundsInspection {
+    /// Share of predictions that the bounds hold for.
+    pub coverage: f32,
+    /// Units they were made from.
+    pub units: u32,
+    /// Steps that have a bound.
+    pub steps: Vec<u32>,
+    /// Shape `[steps, states]`, in the units of the states.
+    pub bounds: Vec<f32>,
 }
 
 /// A state of a blob.
@@ -275,6 +290,12 @@ fn describe(model: &Model<'_>, test: &SelfTest<'_>, bytes: usize) -> Inspection 
                 EquationInspection { output, terms }
             })
             .collect(),
+        error_bounds: model.error_bounds().map(|b| BoundsInspection {
+            coverage: b.coverage(),
+            units: b.units(),
+            steps: b.horizons().to_vec(),
+            bounds: b.bounds().to_vec(),
+        }),
         bytes,
         coefficient_bytes: 4 * model.coefficients().len(),
         logs_sha256: hexadecimal(&provenance.logs),
@@ -307,6 +328,23 @@ impl Inspection {
             t,
             "spectral radius of the one-step map, linearised at the stored sample: {radius}"
         );
+        if let Some(b) = &self.error_bounds {
+            let last = b.bounds.len().saturating_sub(self.states.len());
+            let at_last: Vec<String> = b.bounds[last..]
+                .iter()
+                .zip(&self.states)
+                .map(|(x, s)| format!("{} {} [{}]", s.name, significant(f64::from(*x)), s.unit))
+                .collect();
+            let _ = writeln!(
+                t,
+                "error bounds for {} % from {} units, {} steps; at step {}: {}",
+                significant(100.0 * f64::from(b.coverage)),
+                b.units,
+                b.steps.len(),
+                b.steps.last().copied().unwrap_or(0),
+                at_last.join(", ")
+            );
+        }
         let _ = writeln!(t, "logs        sha256 {}", self.logs_sha256);
         let _ = writeln!(t, "robot.toml  sha256 {}", self.robot_sha256);
 

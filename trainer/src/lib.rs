@@ -9,6 +9,7 @@
 //! | [`chain`] | dictionaries that list their terms one by one |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
 //! | [`score`], [`arx`] | rollouts over windows beside no motion and a linear ARX |
+//! | [`conformal`] | error bounds per state and step from held-out logs |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
 //! | [`forecast`], [`koopman`], [`hermite`], [`edmd_dl`], [`sindy`] | one interface for every method, the methods |
 //! | [`reproduce`], [`convergence`], [`figures`], [`plot`] | the paper's experiments, tables and figures |
@@ -18,6 +19,7 @@
 
 pub mod arx;
 pub mod chain;
+pub mod conformal;
 pub mod convergence;
 pub mod edmd;
 pub mod edmd_dl;

@@ -10,6 +10,7 @@ use firmware_core::blob;
 use firmware_core::model::{Model, Space, Structure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
+use trainer::conformal::{CoverageReport, Residuals, Unit, least_units, with_bounds};
 use trainer::edmd;
 use trainer::export::{controller_coefficients, export, write_whole};
 use trainer::figures;
@@ -23,7 +24,7 @@ use trainer::robot::{Method, Robot, ScoreOptions};
 use trainer::score::{self, Counts, Lifted};
 use trainer::spectrum_report::SpectrumReport;
 use trainer::topology::{Orders, lifting};
-use trainer::trajectory::Logs;
+use trainer::trajectory::{Logs, collect};
 
 /// Fits Koopman models to robot logs and writes them as blobs that a microcontroller reads.
 #[derive(Parser)]
@@ -38,6 +39,7 @@ enum Command {
     Fit(FitArgs),
     Evaluate(EvaluateArgs),
     Inspect(InspectArgs),
+    Calibrate(CalibrateArgs),
     Spectrum(SpectrumArgs),
     Dictionary(DictionaryArgs),
     Resample(ResampleArgs),
@@ -90,6 +92,29 @@ struct EvaluateArgs {
     /// Print JSON instead of text.
     #[arg(long)]
     json: bool,
+}
+
+/// Measure how far off a blob's rollouts are on logs that it was not fitted on, and store bounds for
+/// every state and step in it (split-conformal prediction).
+#[derive(Args)]
+struct CalibrateArgs {
+    /// The blob.
+    model: PathBuf,
+    /// Folder of CSV logs that the model has not seen, or one CSV file.
+    #[arg(long, value_name = "DIR")]
+    logs: PathBuf,
+    /// Share of predictions that the bounds shall hold for.
+    #[arg(long, value_name = "P", default_value_t = 0.9)]
+    coverage: f64,
+    /// Steps of a rollout, each of which gets a bound [default: as in robot.toml, or 50].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    horizon: Option<u32>,
+    /// The robot.toml that names the columns [default: as for evaluate].
+    #[arg(long, value_name = "FILE")]
+    robot: Option<PathBuf>,
+    /// Where the blob with the bounds is written [default: in place].
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
 }
 
 /// Show everything in a blob in readable form.
@@ -208,6 +233,7 @@ fn main() -> ExitCode {
         Command::Fit(args) => fit(&args),
         Command::Evaluate(args) => evaluate(&args),
         Command::Inspect(args) => show_blob(&args),
+        Command::Calibrate(args) => calibrate(&args),
         Command::Spectrum(args) => spectrum(&args),
         Command::Dictionary(args) => dictionary(&args),
         Command::Resample(args) => resample_logs(&args),
@@ -495,15 +521,16 @@ fn refused(path: &Path, error: blob::ParseError) -> Failure {
 /// The columns of a log, from the description beside the blob or the blob itself; and the options
 /// for scoring.
 fn log_schema(
-    args: &EvaluateArgs,
+    (path, robot): (&Path, Option<&PathBuf>),
+    (horizon, stride): (Option<u32>, Option<u32>),
     model: &Model<'_>,
 ) -> Result<(LogSchema, ScoreOptions), Failure> {
     let structure = model.structure();
-    let beside = args.model.parent().unwrap_or(Path::new("")).join("robot.toml");
-    let description = args.robot.clone().or_else(|| beside.is_file().then_some(beside));
+    let beside = path.parent().unwrap_or(Path::new("")).join("robot.toml");
+    let description = robot.cloned().or_else(|| beside.is_file().then_some(beside));
     let (schema, mut options) = match description {
-        Some(path) => {
-            let robot = Robot::load(&path)?;
+        Some(description) => {
+            let robot = Robot::load(&description)?;
             let states = robot.states.iter().map(|s| (s.name.as_str(), s.unit.as_str(), s.space));
             let inputs = robot.inputs.iter().map(|u| (u.name.as_str(), u.unit.as_str()));
             if robot.name != structure.robot()
@@ -514,9 +541,9 @@ fn log_schema(
                 return Err(Failure(format!(
                     "{}: the model belongs to `{}`, but {} describes `{}` or other states, inputs or \
                      sample time; give the right one with --robot",
-                    args.model.display(),
-                    structure.robot(),
                     path.display(),
+                    structure.robot(),
+                    description.display(),
                     robot.name
                 )));
             }
@@ -532,10 +559,10 @@ fn log_schema(
         }
     };
     options.hold_out.clear();
-    if let Some(horizon) = args.horizon {
+    if let Some(horizon) = horizon {
         options.horizon = horizon as usize;
     }
-    if let Some(stride) = args.stride {
+    if let Some(stride) = stride {
         options.stride = stride as usize;
     }
     Ok((schema, options))
@@ -550,12 +577,15 @@ struct EvaluateReport<'r> {
     model: String,
     logs: String,
     score: ScoreReport,
+    /// How well the blob's error bounds hold here; `null` where it has none.
+    error_bounds: Option<CoverageReport>,
 }
 
 fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     let file = BlobFile::read(&args.model)?;
     let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
-    let (schema, options) = log_schema(args, &model)?;
+    let place = (args.model.as_path(), args.robot.as_ref());
+    let (schema, options) = log_schema(place, (args.horizon, args.stride), &model)?;
     let recording = Recording::open(&args.logs)?;
     let source = Logs { recording: &recording, schema: &schema };
     if let Some(path) = &args.csv
@@ -627,11 +657,73 @@ fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
         model: args.model.display().to_string(),
         logs: args.logs.display().to_string(),
         score: ScoreReport::new(&score, &labels(structure)),
+        error_bounds: covered(&model, &source)?,
     };
     if args.json {
         return print_json(&report);
     }
-    print(&format!("{} on {}\n{}", report.model, report.logs, report.score.table(true)))
+    let bounds = report.error_bounds.as_ref().map_or_else(String::new, CoverageReport::text);
+    print(&format!("{} on {}\n{}{bounds}", report.model, report.logs, report.score.table(true)))
+}
+
+/// How well the error bounds of a model, if it has any, hold on logs.
+fn covered(model: &Model<'_>, source: &Logs<'_>) -> Result<Option<CoverageReport>, Failure> {
+    let Some(bounds) = model.error_bounds() else { return Ok(None) };
+    let trajectories = collect(source)?;
+    let horizon = bounds.horizons().last().map_or(0, |h| *h as usize);
+    let least = least_units(f64::from(bounds.coverage()))?;
+    let Ok(residuals) = Residuals::measure(model, &trajectories, horizon, least) else {
+        // The logs are shorter than the bounds' horizon; the score is there all the same.
+        return Ok(None);
+    };
+    let names: Vec<&str> = model.structure().states().iter().map(|s| s.name).collect();
+    Ok(CoverageReport::new(&residuals, bounds, &names))
+}
+
+fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
+    let file = BlobFile::read(&args.model)?;
+    let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let test = blob::self_test(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let place = (args.model.as_path(), args.robot.as_ref());
+    let (schema, options) = log_schema(place, (args.horizon, None), &model)?;
+    let least = least_units(args.coverage)?;
+    let recording = Recording::open(&args.logs)?;
+    let trajectories = collect(&Logs { recording: &recording, schema: &schema })?;
+    let residuals = Residuals::measure(&model, &trajectories, options.horizon, least)?;
+    let bounds = residuals.bounds(args.coverage)?;
+    let states: Vec<(String, String)> = labels(model.structure())
+        .into_iter()
+        .map(|(name, unit)| (name.to_owned(), unit.to_owned()))
+        .collect();
+    let bytes = with_bounds(model, &test, args.coverage, &residuals, &bounds, file.bytes().len())
+        .map_err(|e| Failure(format!("the blob cannot be written: {e:?}")))?;
+    let out = args.out.as_ref().unwrap_or(&args.model);
+    write_whole(out, |file| file.write_all(&bytes))?;
+
+    let units = match residuals.unit {
+        Unit::Trajectory => "trajectories, one window each",
+        Unit::Block => "contiguous blocks: too few trajectories for units of their own",
+    };
+    let mut text = format!(
+        "{}: {} bytes, error bounds for {} % from {} {units}\n",
+        out.display(),
+        grouped(bytes.len() as u64),
+        100.0 * args.coverage,
+        residuals.units()
+    );
+    let n = states.len();
+    for (i, (name, unit)) in states.iter().enumerate() {
+        let at = |step: usize| significant(f64::from(bounds[(step - 1) * n + i]));
+        let last = residuals.horizon;
+        text += &format!(
+            "  {name} [{unit}]: {} after 1 step, {} after {}, {} after {last}\n",
+            at(1),
+            at(last.div_ceil(2)),
+            last.div_ceil(2),
+            at(last)
+        );
+    }
+    print(&text)
 }
 
 /// `inspect --json`.

@@ -790,7 +790,7 @@ fn write_window(
 }
 
 /// The controller's f32 predictor over a window; `false` when it diverges.
-fn roll_out_model(
+pub(crate) fn roll_out_model(
     model: &Model<'_>,
     past: &[Vec<f64>],
     future: &[Vec<f64>],

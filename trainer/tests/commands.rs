@@ -171,7 +171,7 @@ fn evaluate_scores_the_blob() {
 
     let evaluate = ["evaluate", "model.bin", "--logs", "fresh", "--json"];
     let report = json(&workshop.succeed(&evaluate));
-    has_fields(&report, &["format", "command", "robot", "model", "logs", "score"]);
+    has_fields(&report, &["format", "command", "robot", "model", "logs", "score", "error_bounds"]);
     assert_eq!((&report["format"], &report["command"]), (&1.into(), &"evaluate".into()));
     assert_eq!((&report["robot"], &report["logs"]), (&"cart".into(), &"fresh".into()));
     assert_eq!(report["model"], "model.bin");
@@ -526,8 +526,16 @@ fn mistakes_on_the_command_line() {
         assert_eq!((said.code, said.stdout.as_str()), (Some(2), ""), "{arguments:?}");
         assert!(said.stderr.contains("--help") || said.stderr.contains("Usage"), "{}", said.stderr);
     }
-    for command in ["fit", "evaluate", "inspect", "spectrum", "dictionary", "resample", "reproduce"]
-    {
+    for command in [
+        "fit",
+        "evaluate",
+        "inspect",
+        "spectrum",
+        "dictionary",
+        "resample",
+        "reproduce",
+        "calibrate",
+    ] {
         let help = workshop.succeed(&[command, "--help"]);
         assert!(help.contains(&format!("Usage: trainer {command}")), "{help}");
     }
@@ -595,4 +603,50 @@ standardise = false
     assert!(scored.contains("x [m]"), "{scored}");
     let message = workshop.refuse(&["spectrum", "."]);
     assert!(message.contains("cart has no spectrum") && message.contains("blocks"), "{message}");
+}
+
+#[test]
+fn calibrate_stores_bounds_that_evaluate_checks() {
+    let workshop = Workshop::new();
+    workshop.describe("[score]", "[dictionary]\norders = { phi = 0 }\n\n[score]");
+    workshop.succeed(&["fit", "."]);
+    let plain = workshop.read("model.bin");
+    // Three trajectories are too few for 90 %; their 21 blocks of 16 rows are not.
+    let said =
+        workshop.succeed(&["calibrate", "model.bin", "--logs", "logs", "--out", "calibrated.bin"]);
+    assert!(said.contains("error bounds for 90 % from 21 contiguous blocks"), "{said}");
+    assert!(said.contains("x [m]: ") && said.contains(" after 10"), "{said}");
+    assert_eq!(workshop.read("model.bin"), plain);
+    // Nothing but the bounds is new, and a second calibration replaces them.
+    let again = ["calibrate", "calibrated.bin", "--logs", "logs", "--coverage", "0.8"];
+    let bytes = workshop.read("calibrated.bin");
+    workshop.succeed(&again);
+    assert_eq!(workshop.read("calibrated.bin").len(), bytes.len());
+    let inspected: Value =
+        serde_json::from_str(&workshop.succeed(&["inspect", "calibrated.bin", "--json"])).unwrap();
+    let bounds = &inspected["error_bounds"];
+    assert_eq!((bounds["coverage"].as_f64(), bounds["units"].as_u64()), (Some(0.8), Some(21)));
+    assert_eq!(bounds["steps"].as_array().unwrap().len(), 10);
+    assert_eq!(bounds["bounds"].as_array().unwrap().len(), 20);
+    assert!(workshop.succeed(&["inspect", "calibrated.bin"]).contains("error bounds for 80.00 %"));
+    // On the very units that made them, the bounds hold for ⌈22 · 0.8⌉ = 18 of 21.
+    let scored = ["evaluate", "calibrated.bin", "--robot", "robot.toml", "--logs", "logs"];
+    let text = workshop.succeed(&scored);
+    assert!(
+        text.contains("Error bounds for 80.0 % from 21 units: on 21 contiguous blocks, 85.7 % to"),
+        "{text}"
+    );
+    let scored: Value =
+        serde_json::from_str(&workshop.succeed(&[&scored[..], &["--json"]].concat())).unwrap();
+    assert!((scored["error_bounds"]["range"][0].as_f64().unwrap() - 18.0 / 21.0).abs() < 1e-12);
+
+    for (arguments, fragment) in [
+        (["--coverage", "0.99"], "21 units (blocks of 16 rows) are too few"),
+        (["--coverage", "1"], "must lie between 0 and 1"),
+        (["--horizon", "400"], "rows of a window"),
+    ] {
+        let command = ["calibrate", "model.bin", "--logs", "logs", arguments[0], arguments[1]];
+        let message = workshop.refuse(&command);
+        assert!(message.contains(fragment), "{message}");
+    }
 }
