@@ -8,7 +8,7 @@
 //! | [`gram`], [`solve`], [`edmd`] | the least-squares problem in constant memory |
 //! | [`chain`] | dictionaries that list their terms one by one |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
-//! | [`score`], [`arx`] | rollouts over windows beside no motion and a linear ARX |
+//! | [`score`], [`arx`], [`unicycle`] | rollouts over windows beside no motion, a linear ARX and a unicycle |
 //! | [`conformal`] | error bounds per state and step from held-out logs |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
 //! | [`forecast`], [`koopman`], [`hermite`], [`edmd_dl`], [`sindy`] | one interface for every method, the methods |
@@ -48,3 +48,4 @@ pub mod spectrum_report;
 pub mod terms;
 pub mod topology;
 pub mod trajectory;
+pub mod unicycle;

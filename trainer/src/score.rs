@@ -1,4 +1,5 @@
-//! Scoring: rollouts over windows of recorded trajectories, beside *no motion* and a linear ARX.
+//! Scoring: rollouts over windows of recorded trajectories, beside *no motion*, a linear ARX
+//! and, where it applies, a unicycle.
 //!
 //! All models of one table see the same windows. A window starts at a sample with enough earlier
 //! ones for every model, and predicts the next `horizon` samples with the inputs as recorded. RMSE
@@ -20,6 +21,7 @@ use crate::recording::Visitor;
 use crate::robot::{FitOptions, ScoreOptions};
 use crate::snapshots::{PairSink, Snapshots};
 use crate::trajectory::Trajectories;
+use crate::unicycle::{Axes, Unicycle, UnicycleAccumulator};
 
 /// What trajectories serve for.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -227,7 +229,7 @@ pub struct Score {
     pub windows: usize,
     /// Standard deviation of the scored data per state.
     pub deviation: Vec<f64>,
-    /// Model, no motion, the chosen ARX.
+    /// Model, no motion, the chosen ARX, and a unicycle where there is one.
     pub contenders: Vec<Contender>,
     /// NRMSE of every ARX, 0 to [`MAX_LAGS`] lags, on the scored data.
     pub arx: Vec<f64>,
@@ -248,6 +250,7 @@ struct FoldModel<'a> {
 struct Fold<'a> {
     model: Option<FoldModel<'a>>,
     arx: Vec<Arx>,
+    unicycle: Option<Unicycle>,
 }
 
 /// Where a fold's lifted model comes from.
@@ -442,6 +445,7 @@ fn train<'a, T: Trajectories>(
         snapshots: Snapshots<'s, 'a, Sink<'p>>,
         recent: VecDeque<Vec<f64>>,
         arx: Vec<ArxAccumulator>,
+        unicycles: Option<Vec<UnicycleAccumulator>>,
         progress: &'p dyn Fn(u64),
     }
     impl Visitor for Pass<'_, '_, '_> {
@@ -463,6 +467,13 @@ fn train<'a, T: Trajectories>(
                             self.recent.iter().map(Vec::as_slice),
                             &self.rows.present[..states.len()],
                         );
+                    }
+                }
+            }
+            if let (Some(unicycles), Some(before)) = (&mut self.unicycles, self.recent.front()) {
+                for (fold, unicycle) in unicycles.iter_mut().enumerate() {
+                    if self.rows.plan.trains(fold, self.rows.role, row) {
+                        unicycle.pair(before, &self.rows.present);
                     }
                 }
             }
@@ -488,6 +499,8 @@ fn train<'a, T: Trajectories>(
         snapshots: Snapshots::new(structure, Sink { plan, role: Role::Skipped, regressions }),
         recent: VecDeque::new(),
         arx: vec![ArxAccumulator::new(n, m); plan.folds()],
+        unicycles: Axes::of(structure)
+            .map(|axes| vec![UnicycleAccumulator::new(axes); plan.folds()]),
         progress,
     };
     source.visit(&mut pass).map_err(ScoreError::Trajectories)?;
@@ -517,7 +530,8 @@ fn train<'a, T: Trajectories>(
         };
         let arx: Option<Vec<Arx>> = (0..=MAX_LAGS).map(|lags| arx.fit(lags)).collect();
         let Some(arx) = arx else { return Err(untrained) };
-        folds.push(Fold { model, arx });
+        let unicycle = pass.unicycles.as_ref().and_then(|u| u.get(fold)?.fit());
+        folds.push(Fold { model, arx, unicycle });
     }
     Ok(folds)
 }
@@ -578,6 +592,8 @@ impl Errors {
 const MODEL: usize = 0;
 const NO_MOTION: usize = 1;
 const ARX: usize = 2;
+/// Behind them.
+const UNICYCLE: usize = ARX + MAX_LAGS + 1;
 
 struct Scorer<'t, 'a, 'w> {
     rows: Rows<'t>,
@@ -625,7 +641,7 @@ fn run<T: Trajectories>(
         window: VecDeque::new(),
         segment: 0,
         first: structure.lag().max(MAX_LAGS),
-        errors: vec![Errors::new(n); ARX + MAX_LAGS + 1],
+        errors: vec![Errors::new(n); UNICYCLE + 1],
         spreads: vec![Spread::default(); n],
         predicted: vec![0.0; n * horizon],
         predictions,
@@ -655,11 +671,18 @@ fn run<T: Trajectories>(
         stride: task.options.stride,
         first: scorer.first,
         windows,
-        contenders: vec![
-            contender(MODEL, "model"),
-            contender(NO_MOTION, "no motion"),
-            arx[arx_lags].clone(),
-        ],
+        contenders: [
+            Some(contender(MODEL, "model")),
+            Some(contender(NO_MOTION, "no motion")),
+            Some(arx[arx_lags].clone()),
+            task.folds
+                .iter()
+                .all(|fold| fold.unicycle.is_some())
+                .then(|| contender(UNICYCLE, "unicycle")),
+        ]
+        .into_iter()
+        .flatten()
+        .collect(),
         deviation,
         arx: nrmse,
         arx_lags,
@@ -723,6 +746,10 @@ impl Scorer<'_, '_, '_> {
                         .for_each(|row| row.copy_from_slice(&present[..n]));
                     true
                 }
+                UNICYCLE => match &self.task.folds[fold].unicycle {
+                    Some(unicycle) => unicycle.roll_out(past, future, predicted),
+                    None => continue,
+                },
                 _ => roll_out_arx(
                     &self.task.folds[fold].arx[contender - ARX],
                     past,
