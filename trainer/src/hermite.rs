@@ -86,6 +86,7 @@ impl Baseline for Hermite {
             // An input that never moves is no reason to fail.
             fit: FitOptions { method: Method::Svd, ..Default::default() },
             score: ScoreOptions::default(),
+            budget: Default::default(),
             sha256: [0; 32],
         };
         Koopman::fit(&robot, training).map(Self).map_err(|error| match error {

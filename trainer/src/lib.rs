@@ -9,6 +9,7 @@
 //! | [`chain`] | dictionaries that list their terms one by one |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
 //! | [`score`], [`arx`], [`unicycle`] | rollouts over windows beside no motion, a linear ARX and a unicycle |
+//! | [`select`], [`library`], [`cost`] | the search for the best rollout that fits a controller |
 //! | [`conformal`] | error bounds per state and step from held-out logs |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
 //! | [`forecast`], [`koopman`], [`hermite`], [`edmd_dl`], [`sindy`] | one interface for every method, the methods |
@@ -21,6 +22,7 @@ pub mod arx;
 pub mod chain;
 pub mod conformal;
 pub mod convergence;
+pub mod cost;
 pub mod edmd;
 pub mod edmd_dl;
 pub mod export;
@@ -31,6 +33,7 @@ pub mod gram;
 pub mod hermite;
 pub mod inspect;
 pub mod koopman;
+pub mod library;
 mod paper;
 mod paper_report;
 pub mod plot;
@@ -40,9 +43,12 @@ pub mod reproduce;
 pub mod resample;
 pub mod robot;
 pub mod score;
+pub mod select;
+mod select_report;
 pub mod sindy;
 pub mod snapshots;
 pub mod solve;
+mod sparse_fit;
 pub mod spectrum;
 pub mod spectrum_report;
 pub mod terms;

@@ -22,6 +22,7 @@ use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
 use trainer::robot::{Method, Robot, ScoreOptions};
 use trainer::score::{self, Counts, Lifted};
+use trainer::select::{self, Budget};
 use trainer::spectrum_report::SpectrumReport;
 use trainer::topology::{Orders, lifting};
 use trainer::trajectory::{Logs, collect};
@@ -40,6 +41,7 @@ enum Command {
     Evaluate(EvaluateArgs),
     Inspect(InspectArgs),
     Calibrate(CalibrateArgs),
+    Select(SelectArgs),
     Spectrum(SpectrumArgs),
     Dictionary(DictionaryArgs),
     Resample(ResampleArgs),
@@ -115,6 +117,41 @@ struct CalibrateArgs {
     /// Where the blob with the bounds is written [default: in place].
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+}
+
+/// Search the sparse model with the best rollouts that fits a controller's budget.
+///
+/// Looks at the states, inputs and logs of a robot, not at its dictionary. Writes a folder with the
+/// winner's robot.toml, its blob, a plot of rollout error against instructions, and a journal from
+/// which an interrupted search goes on.
+#[derive(Args)]
+struct SelectArgs {
+    /// The robot's folder, or its robot.toml.
+    robot: PathBuf,
+    /// Folder of CSV logs, or one CSV file [default: logs/ beside robot.toml].
+    #[arg(long, value_name = "DIR")]
+    logs: Option<PathBuf>,
+    /// Folder for what is found [default: selected/ beside robot.toml].
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Most instructions of one step, by the cost table [default: as in robot.toml, or no limit].
+    #[arg(long, value_name = "N")]
+    max_instructions: Option<u32>,
+    /// Most bytes of the blob [default: as in robot.toml, or no limit].
+    #[arg(long, value_name = "N")]
+    max_bytes: Option<u32>,
+    /// Most terms beside the constant [default: as in robot.toml, or 60].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=255))]
+    max_terms: Option<u32>,
+    /// Stop after this many candidates: the number that a report gives repeats its search exactly.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    max_candidates: Option<u32>,
+    /// Stop after this many seconds; where that is depends on the machine.
+    #[arg(long, value_name = "S", default_value_t = 120, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    time_limit: u32,
+    /// Threads; the result does not depend on them.
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=64))]
+    threads: u8,
 }
 
 /// Show everything in a blob in readable form.
@@ -234,6 +271,7 @@ fn main() -> ExitCode {
         Command::Evaluate(args) => evaluate(&args),
         Command::Inspect(args) => show_blob(&args),
         Command::Calibrate(args) => calibrate(&args),
+        Command::Select(args) => select_model(&args),
         Command::Spectrum(args) => spectrum(&args),
         Command::Dictionary(args) => dictionary(&args),
         Command::Resample(args) => resample_logs(&args),
@@ -969,4 +1007,83 @@ fn reproduce_paper(args: &ReproduceArgs) -> Result<(), Failure> {
         return print_json(&results);
     }
     print(&format!("{report}\nReport and figures: {}\n", file.display()))
+}
+
+fn select_model(args: &SelectArgs) -> Result<(), Failure> {
+    let robot = Robot::load(&args.robot)?;
+    let folder = folder(&args.robot);
+    let file = if args.robot.is_dir() { args.robot.join("robot.toml") } else { args.robot.clone() };
+    let original = std::fs::read_to_string(&file)
+        .map_err(|e| format!("{}: cannot be read: {e}", file.display()))?;
+    let logs = args.logs.clone().unwrap_or_else(|| folder.join("logs"));
+    let out = args.out.clone().unwrap_or_else(|| folder.join("selected"));
+    let recording = Recording::open(&logs)?;
+    let source = Logs { recording: &recording, schema: &robot.schema };
+    let description = out.join("robot.toml");
+    if std::fs::canonicalize(&description)
+        .is_ok_and(|found| std::fs::canonicalize(&file).is_ok_and(|given| given == found))
+    {
+        return Err(Failure(format!(
+            "{}: the description that is searched for would be replaced; give another --out",
+            description.display()
+        )));
+    }
+    let is_new = !out.exists();
+    std::fs::create_dir_all(&out).map_err(|e| format!("{}: cannot be made: {e}", out.display()))?;
+    let default = Budget::default();
+    let limit = |given: Option<u32>, described: Option<u32>, default: u32| {
+        given.or(described).unwrap_or(default)
+    };
+    let described = robot.budget;
+    let options = select::Options {
+        budget: Budget {
+            instructions: limit(
+                args.max_instructions,
+                described.max_instructions,
+                default.instructions,
+            ),
+            bytes: limit(args.max_bytes, described.max_bytes, default.bytes),
+            terms: args.max_terms.or(described.max_terms).map_or(default.terms, |n| n as usize),
+            candidates: args.max_candidates.map_or(default.candidates, |n| n as usize),
+            time: std::time::Duration::from_secs(args.time_limit.into()),
+        },
+        score: robot.score.clone(),
+        threads: args.threads.into(),
+        journal: Some(out.join("journal.jsonl")),
+    };
+    let bar = ProgressBar::new(args.time_limit.into());
+    if let Ok(style) =
+        ProgressStyle::with_template("{wide_bar} {elapsed} of at most {len} s  {msg}")
+    {
+        bar.set_style(style);
+    }
+    let found = select::select(&robot, &source, &options, &|progress| {
+        bar.set_position(bar.elapsed().as_secs());
+        bar.set_message(format!(
+            "{} candidates, best NRMSE {}",
+            grouped(progress.evaluated as u64),
+            significant(progress.best)
+        ));
+    });
+    bar.finish_and_clear();
+    if found.is_err() && is_new {
+        // Empty but for the journal of a search that found nothing.
+        let _ = std::fs::remove_dir_all(&out);
+    }
+    let found = found?;
+    let text = found.robot_toml(&original, found.winner);
+    let chosen = Robot::parse(&text, &description)?;
+    let fitted = edmd::fit(&chosen, &source, &|_| {})?;
+    let bytes = export(&fitted)?;
+    write_whole(&description, |file| file.write_all(text.as_bytes()))?;
+    write_whole(&out.join("model.bin"), |file| file.write_all(&bytes))?;
+    write_whole(&out.join("front.svg"), |file| file.write_all(found.figure().as_bytes()))?;
+    print(&format!(
+        "{}\n{}: {} bytes, fitted on all trajectories\n`trainer fit {} --logs {}` scores it\n",
+        found.report().trim_end(),
+        out.join("model.bin").display(),
+        grouped(bytes.len() as u64),
+        out.display(),
+        logs.display()
+    ))
 }

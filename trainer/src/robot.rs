@@ -70,6 +70,8 @@ struct RobotToml {
     fit: FitOptions,
     #[serde(default)]
     score: ScoreOptions,
+    #[serde(default)]
+    budget: BudgetOptions,
 }
 
 fn default_time_column() -> String {
@@ -231,6 +233,18 @@ impl Default for ScoreOptions {
     }
 }
 
+/// The `[budget]` table: what the controller can spare for the model, for `trainer select`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BudgetOptions {
+    /// Instructions of one step.
+    pub max_instructions: Option<u32>,
+    /// Bytes of the blob.
+    pub max_bytes: Option<u32>,
+    /// Terms beside the constant.
+    pub max_terms: Option<u32>,
+}
+
 /// A state coordinate of the robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RobotState {
@@ -288,6 +302,8 @@ pub struct Robot {
     pub fit: FitOptions,
     /// How to score.
     pub score: ScoreOptions,
+    /// What the controller can spare.
+    pub budget: BudgetOptions,
     /// SHA-256 of the description.
     pub sha256: [u8; 32],
 }
@@ -515,6 +531,7 @@ impl Robot {
             standardise: toml.dictionary.standardise,
             fit: toml.fit,
             score: toml.score,
+            budget: toml.budget,
             sha256,
         };
         // Everything that the controller will check is checked here once, with its words.

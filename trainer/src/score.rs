@@ -58,7 +58,7 @@ pub enum Plan {
 
 /// What one row serves for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Role {
+pub(crate) enum Role {
     Skipped,
     /// Scored in this fold, trains the others.
     Fold(usize),
@@ -87,7 +87,7 @@ impl Plan {
         }
     }
 
-    fn folds(&self) -> usize {
+    pub(crate) fn folds(&self) -> usize {
         match self {
             Self::Folds { folds, .. } | Self::Blocks { folds, .. } => *folds,
             Self::HoldOut { .. } | Self::All => 1,
@@ -95,7 +95,7 @@ impl Plan {
     }
 
     /// `index` counts the trajectories that are not skipped.
-    fn role(&self, name: &str, index: usize, row: u64) -> Role {
+    pub(crate) fn role(&self, name: &str, index: usize, row: u64) -> Role {
         match self {
             Self::Folds { skip, .. } | Self::Blocks { skip, .. } if matches_any(skip, name) => {
                 Role::Skipped
@@ -111,7 +111,7 @@ impl Plan {
     }
 
     /// Whether a row trains a fold's models.
-    fn trains(&self, fold: usize, role: Role, row: u64) -> bool {
+    pub(crate) fn trains(&self, fold: usize, role: Role, row: u64) -> bool {
         match (self, role) {
             (_, Role::Skipped | Role::Test) => false,
             (_, Role::Train | Role::Both) => true,
@@ -128,7 +128,7 @@ impl Plan {
 }
 
 /// Whether a name matches one of the patterns; `*` stands for any text, `?` for one character.
-fn matches_any(patterns: &[String], name: &str) -> bool {
+pub(crate) fn matches_any(patterns: &[String], name: &str) -> bool {
     fn matches(pattern: &[u8], name: &[u8]) -> bool {
         match (pattern.split_first(), name.split_first()) {
             (None, None) => true,

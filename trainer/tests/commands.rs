@@ -650,3 +650,33 @@ fn calibrate_stores_bounds_that_evaluate_checks() {
         assert!(message.contains(fragment), "{message}");
     }
 }
+
+#[test]
+fn select_finds_a_model_within_the_budget() {
+    let workshop = Workshop::new();
+    let search = ["select", ".", "--max-terms", "6", "--max-candidates", "150"];
+    let said = workshop.succeed(&search);
+    assert!(said.contains("150 candidates") && said.contains("<- winner"), "{said}");
+    let found = workshop.read("selected/robot.toml");
+    let text = String::from_utf8(found.clone()).unwrap();
+    assert!(
+        text.contains("terms = [") && text.contains("Found by `trainer select` among 150"),
+        "{text}"
+    );
+    assert!(workshop.read("selected/front.svg").starts_with(b"<svg"));
+    // The blob is the fit of the description that lies beside it.
+    let blob = workshop.read("selected/model.bin");
+    let fitted = workshop.succeed(&["fit", "selected", "--logs", "logs"]);
+    assert!(fitted.contains("RMSE over 10 steps"), "{fitted}");
+    assert_eq!(workshop.read("selected/model.bin"), blob);
+    // From the journal, from scratch and with another number of threads: the same.
+    workshop.succeed(&search);
+    assert_eq!(workshop.read("selected/robot.toml"), found);
+    workshop.succeed(&[&search[..], &["--out", "again", "--threads", "1"]].concat());
+    assert_eq!(workshop.read("again/robot.toml"), found);
+
+    let message = workshop.refuse(&["select", ".", "--max-bytes", "10", "--out", "small"]);
+    assert!(message.contains("fits the budget"), "{message}");
+    let message = workshop.refuse(&["select", ".", "--out", "."]);
+    assert!(message.contains("would be replaced"), "{message}");
+}
