@@ -8,7 +8,9 @@ use firmware_core::model::{ModelError, Provenance, Space, Structure};
 use crate::chain::Chain;
 use crate::gram::{GramAccumulator, NormalEquations};
 use crate::recording::{Summary, Visitor};
+use crate::refine::{Collected, refine_operator};
 use crate::robot::{FitOptions, Method, Robot, Scaling};
+use crate::score::Plan;
 use crate::snapshots::{PairSink, Snapshots};
 use crate::solve::{self, RFactor, Svd};
 use crate::terms::distinct_terms;
@@ -425,7 +427,12 @@ pub fn fit<'r, T: Trajectories>(
         let observable = crate::terms::observable_name(robot, robot.observables[bound / 2]);
         return Err(FitError::TooLarge { observable });
     }
-    let operator = solve_named(robot, &structure, regression)?;
+    let mut operator = solve_named(robot, &structure, regression)?;
+    if let Some(kappa) = robot.fit.refine {
+        let collected = Collected::read(trajectories, &structure, &Plan::All, &robot.score);
+        let collected = collected.map_err(FitError::Trajectories)?;
+        refine_operator(&structure, chain, &mut operator, &collected.of(0), kappa);
+    }
 
     let mut limits = robot.limits();
     for (i, (limit, state)) in limits.iter_mut().zip(&robot.states).enumerate() {

@@ -71,17 +71,25 @@ fn to_powers(block: &mut [f64], radix: usize, after: usize) {
     }
 }
 
-/// The f32 coefficients of the blob: of a dense model, or of the terms of a chain.
+/// The coefficients of a model as the core has them: of a dense one, or of the terms of a chain.
+pub fn model_coefficients(
+    dictionary: &Dictionary,
+    chain: Option<&Chain>,
+    operator: &Operator,
+) -> Vec<f64> {
+    match chain {
+        Some(chain) => chain.spread(&operator.matrix, operator.outputs),
+        None => monomial_coefficients(dictionary, operator),
+    }
+}
+
+/// [`model_coefficients`] in f32, as in the blob.
 pub fn controller_coefficients(
     dictionary: &Dictionary,
     chain: Option<&Chain>,
     operator: &Operator,
 ) -> Vec<f32> {
-    let coefficients = match chain {
-        Some(chain) => chain.spread(&operator.matrix, operator.outputs),
-        None => monomial_coefficients(dictionary, operator),
-    };
-    coefficients.into_iter().map(|c| c as f32).collect()
+    model_coefficients(dictionary, chain, operator).into_iter().map(|c| c as f32).collect()
 }
 
 /// The model of a structure with the coefficients of [`controller_coefficients`].

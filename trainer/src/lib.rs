@@ -38,6 +38,7 @@ mod paper;
 mod paper_report;
 pub mod plot;
 pub mod recording;
+pub mod refine;
 pub mod report;
 pub mod reproduce;
 pub mod resample;

@@ -488,6 +488,12 @@ impl Chain {
         false
     }
 
+    /// `[parent, function]` of entries 1, 2, …, as the controller has them where it
+    /// [fits](Self::fits).
+    pub fn controller_entries(&self) -> Vec<[u8; 2]> {
+        self.entries.iter().map(|entry| entry.map(|i| u8::try_from(i).unwrap_or(0))).collect()
+    }
+
     /// The entry of every term.
     pub fn place(&self) -> &[usize] {
         &self.place

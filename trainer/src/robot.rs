@@ -204,11 +204,20 @@ pub struct FitOptions {
     pub ridge: f64,
     /// For `svd`: singular values up to this fraction of the largest one are dropped.
     pub truncation: f64,
+    /// Move the operator towards better rollouts, held by the one-step fit this firmly (see
+    /// [`refine`](crate::refine)); `None`: leave it at the one-step fit.
+    pub refine: Option<f64>,
 }
 
 impl Default for FitOptions {
     fn default() -> Self {
-        Self { method: Method::Cholesky, scale_columns: true, ridge: 0.0, truncation: 1e-10 }
+        Self {
+            method: Method::Cholesky,
+            scale_columns: true,
+            ridge: 0.0,
+            truncation: 1e-10,
+            refine: None,
+        }
     }
 }
 
@@ -225,6 +234,14 @@ pub struct ScoreOptions {
     /// Score on the trajectories whose name matches one of these patterns (`*` and `?`), trained on
     /// the others, instead of cross-validation.
     pub hold_out: Vec<String>,
+}
+
+impl ScoreOptions {
+    /// Samples before the present one of the first window: enough for a model with this lag and for
+    /// every linear ARX.
+    pub(crate) fn first(&self, lag: usize) -> usize {
+        lag.max(crate::arx::MAX_LAGS)
+    }
 }
 
 impl Default for ScoreOptions {
@@ -487,6 +504,7 @@ impl Robot {
             }
         };
         positive("fit.ridge", toml.fit.ridge)?;
+        positive("fit.refine", toml.fit.refine.unwrap_or(0.0))?;
         positive("fit.truncation", toml.fit.truncation)?;
         if toml.fit.truncation >= 1.0 {
             return fail("fit.truncation".into(), "expected a number below 1, or nothing is left");

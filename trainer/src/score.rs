@@ -18,6 +18,7 @@ use crate::chain::Chain;
 use crate::edmd::{Operator, Regression, Spread};
 use crate::export::{controller_coefficients, coordinate};
 use crate::recording::Visitor;
+use crate::refine::{Collected, refine_operator};
 use crate::robot::{FitOptions, ScoreOptions};
 use crate::snapshots::{PairSink, Snapshots};
 use crate::trajectory::Trajectories;
@@ -286,7 +287,7 @@ pub fn score<'a, T: Trajectories>(
     let lag = lifted.structure().lag();
     if options.hold_out.is_empty() {
         let plan = Plan::cross_validation(options, counts, lag, &[]);
-        let folds = train(source, &plan, lifted, true, progress)?;
+        let folds = train(source, &plan, lifted, (true, options), progress)?;
         let task = Task { plan: &plan, lifted, options, folds: &folds, arx_lags: None };
         return run(source, task, predictions, progress);
     }
@@ -296,7 +297,7 @@ pub fn score<'a, T: Trajectories>(
     }
     let arx_lags = best_arx(source, counts, lifted, options, &options.hold_out, progress)?;
     let plan = Plan::HoldOut { patterns: options.hold_out.clone() };
-    let folds = train(source, &plan, lifted, true, progress)?;
+    let folds = train(source, &plan, lifted, (true, options), progress)?;
     let task = Task { plan: &plan, lifted, options, folds: &folds, arx_lags: Some(arx_lags) };
     run(source, task, predictions, progress)
 }
@@ -315,7 +316,7 @@ pub fn score_elsewhere<'a, T: Trajectories>(
 ) -> Result<Score, ScoreError<T::Error>> {
     let lifted = Lifted::Given(model);
     let arx_lags = best_arx(training, counts, lifted, options, &[], progress)?;
-    let folds = train(training, &Plan::All, lifted, true, progress)?;
+    let folds = train(training, &Plan::All, lifted, (true, options), progress)?;
     let task = Task { plan: &Plan::All, lifted, options, folds: &folds, arx_lags: Some(arx_lags) };
     run(source, task, predictions, progress)
 }
@@ -331,7 +332,7 @@ fn best_arx<T: Trajectories>(
 ) -> Result<usize, ScoreError<T::Error>> {
     let counts = if skip.is_empty() { counts } else { count(source, skip)? };
     let plan = Plan::cross_validation(options, counts, lifted.structure().lag(), skip);
-    let folds = train(source, &plan, lifted, false, progress)?;
+    let folds = train(source, &plan, lifted, (false, options), progress)?;
     let task = Task { plan: &plan, lifted, options, folds: &folds, arx_lags: None };
     Ok(run(source, task, None, progress)?.arx_lags)
 }
@@ -361,7 +362,7 @@ pub fn count<T: Trajectories>(source: &T, skip: &[String]) -> Result<Counts, Sco
 }
 
 /// Makes angles continuous within a trajectory and knows each row's role.
-struct Rows<'p> {
+pub(crate) struct Rows<'p> {
     plan: &'p Plan,
     circles: Vec<bool>,
     name: String,
@@ -374,7 +375,7 @@ struct Rows<'p> {
 }
 
 impl<'p> Rows<'p> {
-    fn new(plan: &'p Plan, structure: &Structure<'_>) -> Self {
+    pub(crate) fn new(plan: &'p Plan, structure: &Structure<'_>) -> Self {
         Self {
             plan,
             circles: structure.states().iter().map(|s| s.space == Space::Circle).collect(),
@@ -386,7 +387,22 @@ impl<'p> Rows<'p> {
         }
     }
 
-    fn begin(&mut self, name: &str) {
+    /// Number, in its trajectory, of the row that comes next.
+    pub(crate) fn row(&self) -> u64 {
+        self.row
+    }
+
+    /// States (angles continuous), then inputs, of the row taken last.
+    pub(crate) fn present(&self) -> &[f64] {
+        &self.present
+    }
+
+    /// The folds whose models the row taken last, which had this number, trains.
+    pub(crate) fn trains(&self, row: u64) -> Vec<bool> {
+        (0..self.plan.folds()).map(|fold| self.plan.trains(fold, self.role, row)).collect()
+    }
+
+    pub(crate) fn begin(&mut self, name: &str) {
         name.clone_into(&mut self.name);
         self.row = 0;
         self.present.clear();
@@ -396,7 +412,7 @@ impl<'p> Rows<'p> {
     }
 
     /// Takes a row; `true` when a new segment starts: a trajectory, or a block of the only one.
-    fn take(&mut self, states: &[f64], inputs: &[f64]) -> bool {
+    pub(crate) fn take(&mut self, states: &[f64], inputs: &[f64]) -> bool {
         let first = self.present.is_empty();
         let mut next = Vec::with_capacity(states.len() + inputs.len());
         for (i, x) in states.iter().enumerate() {
@@ -421,7 +437,7 @@ fn train<'a, T: Trajectories>(
     source: &T,
     plan: &Plan,
     lifted: Lifted<'_, 'a>,
-    with_model: bool,
+    (with_model, score): (bool, &ScoreOptions),
     progress: &dyn Fn(u64),
 ) -> Result<Vec<Fold<'a>>, ScoreError<T::Error>> {
     struct Sink<'p> {
@@ -505,15 +521,26 @@ fn train<'a, T: Trajectories>(
     };
     source.visit(&mut pass).map_err(ScoreError::Trajectories)?;
     let regressions = pass.snapshots.into_sink().regressions;
+    let refined = match lifted {
+        Lifted::Fitted(structure, _, FitOptions { refine: Some(_), .. }) if with_model => {
+            let read = Collected::read(source, structure, plan, score);
+            Some(read.map_err(ScoreError::Trajectories)?)
+        }
+        _ => None,
+    };
     let mut folds = Vec::new();
     for (fold, (regression, arx)) in regressions.into_iter().zip(pass.arx).enumerate() {
         let untrained = ScoreError::Untrained { fold };
         let model = match (lifted, regression) {
             (Lifted::Fitted(structure, chain, options), Some(regression)) => {
                 let solved = regression.solve(options, structure.outputs());
-                let Ok(operator @ Operator { pairs: 1.., .. }) = solved else {
+                let Ok(mut operator @ Operator { pairs: 1.., .. }) = solved else {
                     return Err(untrained);
                 };
+                if let (Some(collected), Some(kappa)) = (&refined, options.refine) {
+                    let windows = collected.of(fold);
+                    refine_operator(structure, chain, &mut operator, &windows, kappa);
+                }
                 let dictionary = structure.dictionary();
                 Some(FoldModel {
                     structure: structure.clone(),
@@ -640,7 +667,7 @@ fn run<T: Trajectories>(
         models: models.collect(),
         window: VecDeque::new(),
         segment: 0,
-        first: structure.lag().max(MAX_LAGS),
+        first: task.options.first(structure.lag()),
         errors: vec![Errors::new(n); UNICYCLE + 1],
         spreads: vec![Spread::default(); n],
         predicted: vec![0.0; n * horizon],

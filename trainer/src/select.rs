@@ -13,6 +13,8 @@
 //!    holds, then added, dropped and exchanged, always by the rollout error.
 //! 3. The best ones are tried along a path of ridges, and cut down term by term, which makes the
 //!    cheap end of the front.
+//! 4. Some models of the front are [refined](crate::refine) by their rollouts, in every fold, held
+//!    less and less firmly while that helps. No limit cuts this.
 //!
 //! A candidate that diverges in any window, or leaves the range of the data widened by [`MARGIN`] of
 //! its width on both sides (states on ℝ that the symmetry does not exclude), is rejected. The best
@@ -36,7 +38,9 @@ use crate::recording::Visitor;
 use crate::report::hexadecimal;
 use crate::robot::{FitOptions, Robot, ScoreOptions};
 use crate::score::{self, Counts, Lifted, ScoreError};
-use crate::sparse_fit::{Data, Model, Outcome, Problem, Windows, evaluate, roll_out, stress};
+use crate::sparse_fit::{
+    Data, Model, Outcome, Problem, Refinement, Windows, evaluate, roll_out, stress,
+};
 pub use crate::sparse_fit::{MARGIN, Rejection};
 use crate::terms::{Names, robot_names};
 use crate::trajectory::{InMemory, Trajectories, Trajectory};
@@ -45,6 +49,12 @@ use crate::trajectory::{InMemory, Trajectories, Trajectory};
 pub const FRAMES: usize = 2;
 /// Ridges tried, on columns of unit norm.
 pub const RIDGES: [f64; 7] = [1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2];
+/// Models of the front that are refined.
+const REFINED: usize = 8;
+/// How firmly the one-step fit holds a refinement, as far as each is better than the one before.
+pub const KAPPAS: [f64; 3] = [1.0, 0.1, 0.01];
+/// A refinement that gains less than this fraction of the error is not worth having.
+const WORTH_REFINING: f64 = 0.01;
 /// The ridge of the search.
 const RIDGE: f64 = 1e-6;
 /// Terms whose addition, or removal, is tried in one round; more where fewer bring no gain.
@@ -67,9 +77,9 @@ pub struct Budget {
     pub bytes: u32,
     /// Terms, the constant not counted.
     pub terms: usize,
-    /// Candidates evaluated.
+    /// Candidates evaluated, refinements not counted.
     pub candidates: usize,
-    /// Time; where it cuts depends on the machine, the number of [`Selection::candidates`] says how far it came.
+    /// Time; where it cuts depends on the machine, and [`Selection::searched`] says how far it came.
     pub time: Duration,
 }
 
@@ -146,18 +156,35 @@ pub struct Candidate {
     pub terms: Vec<String>,
     /// Ridge on columns of unit norm.
     pub ridge: f64,
+    /// How firmly the one-step fit holds its refinement by rollouts; `None`: it is not refined.
+    pub refine: Option<f64>,
     /// What it takes.
     pub cost: Cost,
     /// Whether the budget and the controller have room for it.
     pub fits: bool,
     /// NRMSE of the rollouts; infinite when rejected.
     pub nrmse: f64,
-    /// RMSE over all steps per state, in its unit.
+    /// RMSE over all steps per state, in its unit; by what the search scores by, as `nrmse`.
     pub rmse: Vec<f64>,
+    /// NRMSE and RMSE per state with one fold left out at a time, over all windows, as `trainer fit`
+    /// scores; of the models of the front.
+    pub cross_validated: Option<(f64, Vec<f64>)>,
     /// Squared errors per unit (trajectory or block) and state.
     sums: Vec<Vec<f64>>,
     /// Why it is not in the race.
     pub rejected: Option<Rejection>,
+}
+
+impl Candidate {
+    /// NRMSE with one fold left out at a time where that is known, otherwise that of the search.
+    pub fn error(&self) -> f64 {
+        self.cross_validated.as_ref().map_or(self.nrmse, |e| e.0)
+    }
+
+    /// RMSE per state that [`error`](Self::error) is made of.
+    pub fn rmse(&self) -> &[f64] {
+        self.cross_validated.as_ref().map_or(&self.rmse, |e| &e.1)
+    }
 }
 
 /// The result of a search.
@@ -171,8 +198,10 @@ pub struct Selection {
     pub trajectories: Vec<String>,
     /// Frames that candidates refer to.
     pub frames: Vec<Frame>,
-    /// All candidates in the order of their evaluation.
+    /// All candidates in the order of their evaluation, refinements last.
     pub candidates: Vec<Candidate>,
+    /// Candidates without refinements: with as many at the most, a search is repeated exactly.
+    pub searched: usize,
     /// Within the budget and not rejected, none of them worse and dearer than another: indices,
     /// cheapest first.
     pub front: Vec<usize>,
@@ -189,6 +218,8 @@ pub struct Selection {
     pub arx: (f64, usize),
     /// Windows, horizon, and units that the standard error is over.
     pub scored: (usize, usize, usize),
+    /// Folds that the search leaves out together, and all folds.
+    pub folds: (usize, usize),
     /// The budget.
     pub budget: Budget,
     /// Seconds that the search took, for the report.
@@ -293,13 +324,13 @@ impl<'s> Search<'s> {
     }
 
     /// Hash of everything that a score depends on.
-    fn key(&self, (frame, terms, ridge): &Model) -> String {
+    fn key(&self, (frame, terms, ridge): &Model, refine: Option<f64>) -> String {
         let problem = &self.problems[*frame];
         let mut hash = Sha256::new();
         let names: Vec<&str> = terms.iter().map(|t| problem.names[*t].as_str()).collect();
         let score = &self.options.score;
         let what = format!(
-            "1 {:?} {:?} {ridge:x} {} {} {} {MARGIN}",
+            "2 {:?} {:?} {ridge:x} {} {} {} {MARGIN}",
             self.frames[*frame],
             names,
             score.horizon,
@@ -308,6 +339,9 @@ impl<'s> Search<'s> {
         );
         hash.update(what.as_bytes());
         hash.update(self.data.hash);
+        if let Some(kappa) = refine {
+            hash.update(format!("refined {kappa:e}"));
+        }
         let digest: [u8; 32] = hash.finalize().into();
         hexadecimal(&digest[..16])
     }
@@ -322,7 +356,7 @@ impl<'s> Search<'s> {
                 new.push(set.clone());
             }
         }
-        let keys: Vec<String> = new.iter().map(|set| self.key(set)).collect();
+        let keys: Vec<String> = new.iter().map(|set| self.key(set, None)).collect();
         let known: Vec<Option<Outcome>> =
             keys.iter().map(|key| self.journal.known.get(key).cloned()).collect();
         let next = AtomicUsize::new(0);
@@ -333,7 +367,9 @@ impl<'s> Search<'s> {
             loop {
                 let i = next.fetch_add(1, Ordering::Relaxed);
                 match (new.get(i), known.get(i)) {
-                    (Some(set), Some(None)) => done.push((i, evaluate(problems, set))),
+                    (Some(set), Some(None)) => {
+                        done.push((i, evaluate(problems, set, None, this.data.search())))
+                    }
                     (Some(_), _) => {}
                     _ => return done,
                 }
@@ -353,21 +389,67 @@ impl<'s> Search<'s> {
         });
         for (((set, key), known), outcome) in new.into_iter().zip(keys).zip(known).zip(outcomes) {
             let Some(outcome) = outcome else { continue };
-            let candidate = self.candidate(&set, &outcome);
-            if known.is_none()
-                && let Err(error) = self.journal.append(&key, candidate.nrmse, &outcome)
-            {
-                self.failed = Some(error);
-            }
-            if candidate.fits {
-                self.best = self.best.min(candidate.nrmse);
-            }
             self.known.insert(set.clone(), self.candidates.len());
-            self.models.push(set);
-            self.candidates.push(candidate);
+            self.take(set, None, (&key, known.is_none()), &outcome);
         }
         (self.progress)(Progress { evaluated: self.candidates.len(), best: self.best });
         sets.iter().map(|set| self.known.get(set).copied()).collect()
+    }
+
+    /// Takes an evaluated candidate, which goes into the journal if it is new.
+    fn take(
+        &mut self,
+        set: Model,
+        refine: Option<f64>,
+        (key, is_new): (&str, bool),
+        outcome: &Outcome,
+    ) {
+        let candidate = Candidate { refine, ..self.candidate(&set, outcome) };
+        if is_new && let Err(error) = self.journal.append(key, candidate.nrmse, outcome) {
+            self.failed = Some(error);
+        }
+        if candidate.fits {
+            self.best = self.best.min(candidate.nrmse);
+        }
+        self.models.push(set);
+        self.candidates.push(candidate);
+    }
+
+    /// How a candidate's fits are refined.
+    fn refinement(&self, refine: Option<f64>) -> Option<Refinement<'s>> {
+        let threads = self.options.threads;
+        refine.map(|kappa| Refinement { data: self.data, kappa, threads })
+    }
+
+    /// Refines models evenly spread over the front, the best among them.
+    fn refine_front(&mut self) {
+        let front = pareto(&self.candidates);
+        let count = front.len().min(REFINED);
+        for i in (1..=count).map(|i| front[i * front.len() / count - 1]) {
+            let set = self.models[i].clone();
+            let mut error = self.candidates[i].nrmse * (1.0 - WORTH_REFINING);
+            for kappa in KAPPAS {
+                let refine = Some(kappa);
+                let key = self.key(&set, refine);
+                let known = self.journal.known.get(&key).cloned();
+                let is_new = known.is_none();
+                let outcome = known.unwrap_or_else(|| {
+                    evaluate(
+                        (&self.problems, self.data),
+                        &set,
+                        self.refinement(refine),
+                        self.data.search(),
+                    )
+                });
+                self.take(set.clone(), refine, (&key, is_new), &outcome);
+                (self.progress)(Progress { evaluated: self.candidates.len(), best: self.best });
+                let found = self.candidates.last().map_or(f64::INFINITY, |c| c.nrmse);
+                if found >= error {
+                    break;
+                }
+                error = found;
+            }
+        }
     }
 
     fn candidate(&self, (frame, terms, ridge): &Model, outcome: &Outcome) -> Candidate {
@@ -375,7 +457,7 @@ impl<'s> Search<'s> {
         let (cost, fits) = self.cost(*frame, terms);
         let sums = outcome.clone().unwrap_or_default();
         let (rmse, nrmse) = match outcome {
-            Ok(sums) => self.data.errors(sums, None),
+            Ok(sums) => self.data.errors(&self.data.searched, sums, None),
             Err(_) => (Vec::new(), f64::INFINITY),
         };
         let terms = terms.iter().map(|t| problem.names[*t].clone()).collect();
@@ -384,10 +466,12 @@ impl<'s> Search<'s> {
             frame: *frame,
             terms,
             ridge: f64::from_bits(*ridge),
+            refine: None,
             cost,
             fits,
             nrmse,
             rmse,
+            cross_validated: None,
             sums,
             rejected,
         }
@@ -579,13 +663,13 @@ impl<'s> Search<'s> {
     fn thresholded(&self, frame: usize, ridge: f64) -> Vec<Vec<usize>> {
         let problem = &self.problems[frame];
         let mut kept: Vec<usize> = (0..problem.terms.len()).collect();
-        let (all, _) = problem.sums(&kept, None);
+        let (all, _) = problem.sums(&kept, &[]);
         let (width, m) = (1 + kept.len() + problem.outputs, problem.outputs);
         let rms = |column: usize| all[column * width + column].sqrt();
         let mut sets = Vec::new();
         for threshold in [1e-3, 3e-3, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.3] {
             for _ in 0..10 {
-                let Some(matrix) = problem.fit(&kept, ridge, None) else { return sets };
+                let Some(matrix) = problem.fit(&kept, ridge, &[]) else { return sets };
                 let share = |k: usize, t: usize| {
                     let of = |o: usize| {
                         (matrix[(k + 1) * m + o] * rms(t + 1)).abs() / rms(width - m + o)
@@ -770,7 +854,7 @@ pub fn select<T: Trajectories>(
     };
     let trajectories = read(&|name| !held_out(name))?;
     let data = Data::new(robot, &trajectories, &options.score, Windows::CrossValidated);
-    if data.windows.is_empty() {
+    if data.all.windows.is_empty() {
         let need = MAX_LAGS + 1 + data.horizon;
         return Err(SelectError::Score(ScoreError::NoWindow { need, first: MAX_LAGS }));
     }
@@ -798,6 +882,8 @@ pub fn select<T: Trajectories>(
         failed: None,
     };
     search.run();
+    let searched = search.candidates.len();
+    search.refine_front();
     if let Some(failed) = search.failed {
         return Err(journal(failed));
     }
@@ -805,8 +891,10 @@ pub fn select<T: Trajectories>(
     let chosen = loop {
         let Some(chosen) = choose(&candidates, &data) else { break None };
         // The two that matter have to stay in range in the training windows of every fold as well.
-        let shaky =
-            [chosen.1, chosen.2].map(|i| (i, stress(&search.problems, &data, &search.models[i])));
+        let shaky = [chosen.1, chosen.2].map(|i| {
+            let refinement = search.refinement(candidates[i].refine);
+            (i, stress(&search.problems, &data, &search.models[i], refinement))
+        });
         if shaky.iter().all(|(_, rejected)| rejected.is_none()) {
             break Some(chosen);
         }
@@ -815,6 +903,18 @@ pub fn select<T: Trajectories>(
             candidates[i].nrmse = f64::INFINITY;
         }
     };
+    if let Some((front, ..)) = &chosen {
+        let single: Vec<Vec<usize>> = (0..data.plan.folds()).map(|fold| vec![fold]).collect();
+        for i in front {
+            let refinement = search.refinement(candidates[*i].refine);
+            let problems = (&search.problems[..], &data);
+            let sums = evaluate(problems, &search.models[*i], refinement, (&single, &data.all));
+            candidates[*i].cross_validated = sums.ok().map(|sums| {
+                let (rmse, nrmse) = data.errors(&data.all, &sums, None);
+                (nrmse, rmse)
+            });
+        }
+    }
     drop(search);
     let Some((front, best, winner, standard_error)) = chosen else {
         let cheapest = candidates.iter().map(|c| c.cost).min().unwrap_or_default();
@@ -827,12 +927,14 @@ pub fn select<T: Trajectories>(
         robot: robot.name.clone(),
         states: robot.states.iter().map(|s| (s.name.clone(), s.unit.clone())).collect(),
         trajectories: names,
-        scored: (data.windows.len(), data.horizon, data.steps.len()),
+        scored: (data.all.windows.len(), data.horizon, data.all.steps.len()),
+        folds: (data.splits.first().map_or(0, Vec::len), data.plan.folds()),
         budget: options.budget,
         seconds: 0.0,
         held_out: Vec::new(),
         frames,
         candidates,
+        searched,
         front,
         best,
         winner,
@@ -854,7 +956,7 @@ pub fn select<T: Trajectories>(
 fn choose(candidates: &[Candidate], data: &Data) -> Option<(Vec<usize>, usize, usize, f64)> {
     let front = pareto(candidates);
     let best = *front.last()?;
-    let error = |i: usize, u| data.errors(&candidates[i].sums, u).1;
+    let error = |i: usize, u| data.errors(&data.searched, &candidates[i].sums, u).1;
     let standard_error = data.jackknife(|u| error(best, u));
     // The same trajectories score both, so the error of their difference counts. But a loss in one
     // trajectory alone looks like one standard error, however large it is: hence the other two.
@@ -966,15 +1068,18 @@ impl Selection {
         let first = terms.iter().map(Term::lag).max().unwrap_or(0).max(first);
         let problem = Problem::new(robot, &self.frames[candidate.frame], terms, data)?;
         let chain = problem.chain(&all);
-        let model = problem.coefficients(&chain, &all, candidate.ridge, None)?;
+        let refinement = candidate.refine.map(|kappa| Refinement { data, kappa, threads: 1 });
+        let model = problem.coefficients(&chain, &all, candidate.ridge, &[], refinement)?;
         let test = Data::new(robot, test, options, Windows::Tested { first });
         // What the test itself does is no divergence.
         let both =
             data.range.iter().zip(&test.range).map(|(a, b)| [a[0].min(b[0]), a[1].max(b[1])]);
         let range: Vec<[f64; 2]> = both.collect();
-        let sums = roll_out(&test, &problem, &chain, Some(vec![model]), &range).ok()?;
-        let (rmse, nrmse) = test.errors(&sums, None);
-        (!test.windows.is_empty()).then_some(Tested { rmse, nrmse })
+        let sums =
+            roll_out((&test, &test.all), &problem, &chain, Some(vec![(&[][..], model)]), &range)
+                .ok()?;
+        let (rmse, nrmse) = test.errors(&test.all, &sums, None);
+        (!test.all.windows.is_empty()).then_some(Tested { rmse, nrmse })
     }
 }
 
@@ -1071,9 +1176,11 @@ mod tests {
         let mut options = options(&robot, 150);
         options.journal = Some(path.clone());
         let first = search(&robot, &walk, &options);
-        assert_eq!(first.candidates.len(), 150);
+        assert_eq!(first.searched, 150);
+        let all = first.candidates.len();
+        assert!(all > 150, "the front is refined");
         let text = std::fs::read_to_string(&path).unwrap();
-        assert_eq!(text.lines().count(), 150);
+        assert_eq!(text.lines().count(), all);
         std::fs::write(&path, &text[..text.len() / 2]).unwrap();
         options.threads = 3;
         let second = search(&robot, &walk, &options);
@@ -1081,7 +1188,7 @@ mod tests {
         assert_eq!(first.candidates, second.candidates);
         // Everything is known now, and only the torn line is evaluated and written again.
         let lines = std::fs::read_to_string(&path).unwrap();
-        assert_eq!(lines.lines().filter(|l| serde_json::from_str::<Line>(l).is_ok()).count(), 150);
+        assert_eq!(lines.lines().filter(|l| serde_json::from_str::<Line>(l).is_ok()).count(), all);
         let third = search(&robot, &walk, &options);
         assert_eq!(
             (first.candidates, lines),
@@ -1111,10 +1218,12 @@ mod tests {
             frame: 0,
             terms: vec!["u".into()],
             ridge: 1e-6,
+            refine: None,
             cost: Cost { instructions, bytes: 0 },
             fits: true,
             nrmse,
             rmse: vec![],
+            cross_validated: None,
             sums: vec![],
             rejected: None,
         };
@@ -1144,14 +1253,24 @@ mod tests {
         let frame = Frame { symmetry: Symmetry::None, targets: vec![Target::Absolute] };
         let problem = Problem::new(&robot, &frame, terms, &data).unwrap();
         let chain = problem.chain(&[0]);
-        let run =
-            |gain: f32| roll_out(&data, &problem, &chain, Some(vec![vec![0.0, gain]]), &data.range);
+        let run = |gain: f32| {
+            roll_out(
+                (&data, &data.all),
+                &problem,
+                &chain,
+                Some(vec![(&[][..], vec![0.0, gain])]),
+                &data.range,
+            )
+        };
         let stays = run(0.9).unwrap();
         assert_eq!((stays.len(), stays[0].len()), (6, 1));
         let leaves = run(2.0).unwrap_err();
         assert_eq!((leaves.state, leaves.trajectory, leaves.row), (Some(0), 0, MAX_LAGS));
-        assert!(leaves.step > 1 && leaves.windows > data.windows.len() / 2);
+        assert!(leaves.step > 1 && leaves.windows > data.all.windows.len() / 2);
         assert_eq!(run(f32::NAN).unwrap_err().state, None);
-        assert_eq!(roll_out(&data, &problem, &chain, None, &data.range).unwrap_err().windows, 0);
+        assert_eq!(
+            roll_out((&data, &data.all), &problem, &chain, None, &data.range).unwrap_err().windows,
+            0
+        );
     }
 }

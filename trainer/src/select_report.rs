@@ -17,12 +17,16 @@ impl Selection {
         let rejected: Vec<&Rejection> =
             self.candidates.iter().filter_map(|c| c.rejected.as_ref()).collect();
         let mut text = format!(
-            "{}: {} candidates in {:.0} s, {} of them rejected; {windows} windows of {horizon} steps, \
-             cross-validated over {units} trajectories or blocks.\n",
+            "{}: {} candidates and {} refinements of the front in {:.0} s, {} of them rejected; {windows} windows of {horizon} steps, \
+             cross-validated over {units} trajectories or blocks.\n\
+             Searched by leaving {} of {} folds out together; `NRMSE` leaves out one, as `trainer fit` does.\n",
             self.robot,
-            grouped(self.candidates.len() as u64),
+            grouped(self.searched as u64),
+            self.candidates.len() - self.searched,
             self.seconds,
             grouped(rejected.len() as u64),
+            self.folds.0,
+            self.folds.1,
         );
         text += &format!(
             "NRMSE of no motion {}, of the linear ARX with {} lags {}.\n\n",
@@ -30,7 +34,7 @@ impl Selection {
             self.arx.1,
             significant(self.arx.0)
         );
-        text += "instructions  bytes  terms    NRMSE\n";
+        text += "instructions  bytes  terms  refined   search    NRMSE\n";
         for i in &self.front {
             let c = &self.candidates[*i];
             let mark = match *i {
@@ -42,22 +46,31 @@ impl Selection {
             };
             let Cost { instructions, bytes } = c.cost;
             text += &format!(
-                "{instructions:12} {bytes:6} {:6} {:>8}{mark}\n",
+                "{instructions:12} {bytes:6} {:6} {:>8} {:>8} {:>8}{mark}\n",
                 c.terms.len(),
-                significant(c.nrmse)
+                c.refine.map_or_else(|| "no".to_owned(), |kappa| kappa.to_string()),
+                significant(c.nrmse),
+                c.cross_validated
+                    .as_ref()
+                    .map_or_else(|| "diverges".to_owned(), |e| significant(e.0)),
             );
         }
         let (winner, best) = (&self.candidates[self.winner], &self.candidates[self.best]);
         text += &format!(
-            "\nbest: {} ± {} (standard error over the trajectories or blocks)\nwinner: {}; {}; ridge {:e}\n  {}\n",
+            "\nbest in the search: {} ± {} (standard error over the trajectories or blocks)\n\
+             winner: NRMSE {}; {}; ridge {:e}; {}\n  {}\n",
             significant(best.nrmse),
             significant(self.standard_error),
-            significant(winner.nrmse),
+            significant(winner.error()),
             self.frame_text(winner.frame),
             winner.ridge,
+            winner.refine.map_or_else(
+                || "one-step fit".to_owned(),
+                |kappa| format!("refined by its rollouts, held by {kappa}")
+            ),
             winner.terms.join(", "),
         );
-        for ((name, unit), rmse) in self.states.iter().zip(&winner.rmse) {
+        for ((name, unit), rmse) in self.states.iter().zip(winner.rmse()) {
             text += &format!("  RMSE {name}: {} {unit}\n", significant(*rmse));
         }
         for (candidate, tested) in &self.held_out {
@@ -116,7 +129,7 @@ impl Selection {
     pub fn figure(&self) -> String {
         let point = |i: &usize| {
             let c = &self.candidates[*i];
-            (f64::from(c.cost.instructions), c.nrmse)
+            (f64::from(c.cost.instructions), c.error())
         };
         let all: Vec<usize> = (0..self.candidates.len())
             .filter(|i| self.candidates[*i].nrmse <= 2.0 * self.no_motion.max(self.arx.0))
@@ -139,7 +152,7 @@ impl Selection {
             axes: Axes::LogY,
             series: vec![
                 series(
-                    "evaluated",
+                    "evaluated, several folds left out",
                     [200, 200, 200],
                     Style::Points,
                     all.iter().map(point).collect(),
@@ -206,15 +219,16 @@ impl Selection {
                 listed(vec![name(x), name(y), name(heading)])
             ),
         };
+        let refine = c.refine.map_or_else(String::new, |kappa| format!("refine = {kappa:?}\n"));
         let terms: String = c.terms.iter().map(|t| format!("    {t:?},\n")).collect();
         let (windows, horizon, units) = self.scored;
         format!(
             "{}\n# Found by `trainer select` among {} candidates: NRMSE {} over {windows} windows of {horizon} steps,\n\
              # cross-validated over {units} trajectories or blocks; about {} instructions a step.\n\
-             {symmetry}[dictionary]\nstandardise = false\nterms = [\n{terms}]\n\n[fit]\nridge = {:e}\n",
+             {symmetry}[dictionary]\nstandardise = false\nterms = [\n{terms}]\n\n[fit]\nridge = {:e}\n{refine}",
             text.trim_end(),
-            grouped(self.candidates.len() as u64),
-            significant(c.nrmse),
+            grouped(self.searched as u64),
+            significant(c.error()),
             c.cost.instructions,
             c.ridge
         )

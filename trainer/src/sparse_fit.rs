@@ -15,6 +15,7 @@ use crate::edmd::{Spread, solve_normal};
 use crate::export::coordinate;
 use crate::gram::NormalEquations;
 use crate::library::{Chain, Frame, Term};
+use crate::refine;
 use crate::robot::{FitOptions, Robot, ScoreOptions};
 use crate::score::{Counts, Plan, Role};
 use crate::solve;
@@ -65,6 +66,33 @@ pub(crate) struct Window {
     pub(crate) row: usize,
 }
 
+/// Windows that are rolled out together.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct WindowSet {
+    pub(crate) windows: Vec<Window>,
+    /// Rows predicted per unit.
+    pub(crate) steps: Vec<f64>,
+}
+
+impl WindowSet {
+    /// At most so many of them, evenly spread.
+    fn thinned(&self, most: usize, horizon: usize) -> Self {
+        let every = self.windows.len().div_ceil(most).max(1);
+        let mut thinned = Self { windows: Vec::new(), steps: vec![0.0; self.steps.len()] };
+        // Every unit keeps some.
+        for own in self.windows.chunk_by(|a, b| a.unit == b.unit) {
+            for window in own.iter().step_by(every) {
+                thinned.windows.push(*window);
+                thinned.steps[window.unit] += horizon as f64;
+            }
+        }
+        thinned
+    }
+}
+
+/// Windows that a search looks at: those of a long log overlap, and say the same again.
+const SEARCH_WINDOWS: usize = 400;
+
 /// What data serve for.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Windows {
@@ -84,12 +112,15 @@ pub(crate) struct Data {
     pub(crate) spaces: Vec<Space>,
     pub(crate) plan: Plan,
     pub(crate) trials: Vec<Trial>,
-    pub(crate) windows: Vec<Window>,
-    /// Rows predicted per unit.
-    pub(crate) steps: Vec<f64>,
+    /// What a search scores by.
+    pub(crate) searched: WindowSet,
+    /// What tables are about.
+    pub(crate) all: WindowSet,
     pub(crate) deviation: Vec<f64>,
     pub(crate) range: Vec<[f64; 2]>,
     pub(crate) horizon: usize,
+    /// The folds that are left out together, of every model that scores a candidate.
+    pub(crate) splits: Vec<Vec<usize>>,
     pub(crate) hash: [u8; 32],
 }
 
@@ -160,13 +191,57 @@ impl Data {
         }
         let deviation = spreads.iter().map(Spread::deviation).collect();
         let hash = hash.finalize().into();
-        Self { n, m, spaces, plan, trials, windows, steps, deviation, range, horizon, hash }
+        let all = WindowSet { windows, steps };
+        Self {
+            n,
+            m,
+            spaces,
+            splits: splits(plan.folds()),
+            plan,
+            trials,
+            searched: all.thinned(SEARCH_WINDOWS, horizon),
+            all,
+            deviation,
+            range,
+            horizon,
+            hash,
+        }
     }
 
-    /// RMSE per state, and NRMSE, of summed squares, without one unit if asked.
-    pub(crate) fn errors(&self, sums: &[Vec<f64>], without: Option<usize>) -> (Vec<f64>, f64) {
+    /// What a search scores by: the splits and the windows.
+    pub(crate) fn search(&self) -> (&[Vec<usize>], &WindowSet) {
+        (&self.splits, &self.searched)
+    }
+
+    /// What a refinement looks at: the windows that train a model that leaves some folds out, thinned
+    /// out, with so many samples before the present one.
+    fn training_windows(&self, lag: usize, out: &[usize]) -> Vec<refine::Window<'_>> {
+        let trains = |w: &&Window| {
+            let rows = || (w.row - lag..=w.row + self.horizon).map(|row| row as u64);
+            let all = |f| rows().all(|row| self.plan.trains(f, Role::Fold(w.fold), row));
+            out.iter().all(|f| all(*f))
+        };
+        let all: Vec<&Window> = self.all.windows.iter().filter(trains).collect();
+        let rows = |w: &&Window| {
+            let (trial, first, end) =
+                (&self.trials[w.trajectory], w.row - lag, w.row + self.horizon + 1);
+            refine::Window {
+                states: &trial.states[first * self.n..end * self.n],
+                inputs: &trial.inputs[first * self.m..end * self.m],
+            }
+        };
+        all.iter().step_by(refine::thinning(all.len())).map(rows).collect()
+    }
+
+    /// RMSE per state, and NRMSE, of summed squares over windows, without one unit if asked.
+    pub(crate) fn errors(
+        &self,
+        set: &WindowSet,
+        sums: &[Vec<f64>],
+        without: Option<usize>,
+    ) -> (Vec<f64>, f64) {
         let kept = |u: &usize| Some(*u) != without;
-        let count: f64 = (0..sums.len()).filter(kept).map(|u| self.steps[u]).sum();
+        let count: f64 = (0..sums.len()).filter(kept).map(|u| set.steps[u]).sum();
         let rmse: Vec<f64> = (0..self.n)
             .map(|i| ((0..sums.len()).filter(kept).map(|u| sums[u][i]).sum::<f64>() / count).sqrt())
             .collect();
@@ -182,7 +257,7 @@ impl Data {
 
     /// The jackknife's standard error, over the units, of a function of the summed squares.
     pub(crate) fn jackknife(&self, of: impl Fn(Option<usize>) -> f64) -> f64 {
-        let units = self.steps.len();
+        let units = self.all.steps.len();
         if units < 2 {
             return 0.0;
         }
@@ -191,6 +266,15 @@ impl Data {
         let squares: f64 = left_out.iter().map(|x| (x - mean) * (x - mean)).sum();
         (squares * (units - 1) as f64 / units as f64).sqrt()
     }
+}
+
+/// The splits of so many folds that the search scores by: half of the folds but one, every other one
+/// of them, are left out together, once from every fold on. A model that holds with little data and in
+/// many ways of leaving data out is more likely to hold elsewhere than one that was chosen by leaving
+/// out a single trajectory at a time (Shao 1993, "Linear model selection by cross-validation").
+pub(crate) fn splits(folds: usize) -> Vec<Vec<usize>> {
+    let out = (folds.saturating_sub(1) / 2).max(1);
+    (0..folds).map(|first| (0..out).map(|k| (first + 2 * k) % folds).collect()).collect()
 }
 
 /// Sums over the pairs that train the same folds and have as many earlier samples.
@@ -287,9 +371,9 @@ impl<'r> Problem<'r> {
         Some(problem)
     }
 
-    /// The sums of some terms (the constant first) and the targets over the pairs that train a fold,
-    /// or all: shape `[columns, columns]`, and the number of pairs.
-    pub(crate) fn sums(&self, terms: &[usize], fold: Option<usize>) -> (Vec<f64>, u64) {
+    /// The sums of some terms (the constant first) and the targets over the pairs that train a model
+    /// that leaves some folds out: shape `[columns, columns]`, and the number of pairs.
+    pub(crate) fn sums(&self, terms: &[usize], out: &[usize]) -> (Vec<f64>, u64) {
         let lag = terms.iter().map(|t| self.terms[*t].lag()).max().unwrap_or(0);
         let all = 1 + self.terms.len() + self.outputs;
         let columns: Vec<usize> = std::iter::once(0)
@@ -299,7 +383,7 @@ impl<'r> Problem<'r> {
         let n = columns.len();
         let (mut sums, mut pairs) = (vec![0.0; n * n], 0);
         for group in &self.groups {
-            if group.earlier < lag || fold.is_some_and(|f| !group.trains[f]) {
+            if group.earlier < lag || out.iter().any(|f| !group.trains[*f]) {
                 continue;
             }
             pairs += group.pairs;
@@ -321,15 +405,32 @@ impl<'r> Problem<'r> {
         Chain::new(&terms.iter().map(|t| &self.terms[*t]).collect::<Vec<_>>())
     }
 
-    /// The controller's coefficients, shape `[entries, outputs]`.
+    /// The controller's coefficients, shape `[entries, outputs]`, refined if asked.
     pub(crate) fn coefficients(
         &self,
         chain: &Chain,
         terms: &[usize],
         ridge: f64,
-        fold: Option<usize>,
+        out: &[usize],
+        refinement: Option<Refinement<'_>>,
     ) -> Option<Vec<f32>> {
-        let fitted = self.fit(terms, ridge, fold)?;
+        let mut fitted = self.fit(terms, ridge, out)?;
+        if let Some(Refinement { data, kappa, threads }) = refinement {
+            let structure = chain.structure(&self.repr).ok()?;
+            let (m, len, entries) = (self.outputs, chain.len(), chain.controller_entries());
+            let expand = |matrix: &[f64]| {
+                let mut coefficients = vec![0.0; len * m];
+                let places = std::iter::once(&0).chain(chain.place());
+                for (place, row) in places.zip(matrix.chunks_exact(m)) {
+                    row.iter().enumerate().for_each(|(o, c)| coefficients[o * len + place] = *c);
+                }
+                coefficients
+            };
+            let entries = Some(&entries[..]);
+            let shape = refine::Shape { structure: &structure, entries, expand: &expand };
+            let windows = data.training_windows(structure.lag(), out);
+            refine::refine(shape, &mut fitted, &windows, kappa, threads);
+        }
         let mut coefficients = vec![0.0; chain.len() * self.outputs];
         let places = std::iter::once(&0).chain(chain.place());
         for (place, row) in places.zip(fitted.chunks_exact(self.outputs)) {
@@ -343,7 +444,7 @@ impl<'r> Problem<'r> {
     /// How much more of what is left of the targets would be left without each of the terms, summed
     /// over the targets.
     pub(crate) fn losses(&self, terms: &[usize], ridge: f64) -> Vec<f64> {
-        let (mut sums, _) = self.sums(terms, None);
+        let (mut sums, _) = self.sums(terms, &[]);
         let (n, m) = (terms.len() + 1, self.outputs);
         let width = n + m;
         let norm: Vec<f64> =
@@ -377,9 +478,9 @@ impl<'r> Problem<'r> {
         (1..n).map(|i| (0..m).map(|o| loss(i, o)).sum()).collect()
     }
 
-    /// Coefficients, shape `[terms + 1, outputs]`, of the pairs that train a fold, or all.
-    pub(crate) fn fit(&self, terms: &[usize], ridge: f64, fold: Option<usize>) -> Option<Vec<f64>> {
-        let (sums, pairs) = self.sums(terms, fold);
+    /// Coefficients, shape `[terms + 1, outputs]`, without some folds.
+    pub(crate) fn fit(&self, terms: &[usize], ridge: f64, out: &[usize]) -> Option<Vec<f64>> {
+        let (sums, pairs) = self.sums(terms, out);
         let (n, m) = (terms.len() + 1, self.outputs);
         let rows = || sums.chunks_exact(n + m).take(n);
         let equations = NormalEquations {
@@ -427,7 +528,7 @@ impl Residual {
     /// Of the whole library, the constant explained away.
     pub(crate) fn new(problem: &Problem<'_>) -> Self {
         let all: Vec<usize> = (0..problem.terms.len()).collect();
-        let (mut sums, _) = problem.sums(&all, None);
+        let (mut sums, _) = problem.sums(&all, &[]);
         let (n, m) = (all.len() + 1, problem.outputs);
         let width = n + m;
         let norm: Vec<f64> =
@@ -496,17 +597,32 @@ impl Residual {
     }
 }
 
-/// Fits a candidate in every fold and rolls it out over all windows.
+/// How fits are refined by their rollouts over the training windows.
+#[derive(Clone, Copy)]
+pub(crate) struct Refinement<'d> {
+    pub(crate) data: &'d Data,
+    /// How firmly the one-step fit holds.
+    pub(crate) kappa: f64,
+    /// The result does not depend on it.
+    pub(crate) threads: usize,
+}
+
+/// A model and the folds that were left out of its fit; none for one fitted on everything.
+pub(crate) type Without<'s> = (&'s [usize], Vec<f32>);
+
+/// Fits a candidate without the folds of every split and rolls it out over the windows of these.
 pub(crate) fn evaluate(
     (problems, data): (&[Problem<'_>], &Data),
     (frame, terms, ridge): &Model,
+    refinement: Option<Refinement<'_>>,
+    (splits, set): (&[Vec<usize>], &WindowSet),
 ) -> Outcome {
     let problem = &problems[*frame];
     let chain = problem.chain(terms);
     let ridge = f64::from_bits(*ridge);
-    let fold = |fold| problem.coefficients(&chain, terms, ridge, Some(fold));
-    let models: Option<Vec<_>> = (0..data.plan.folds()).map(fold).collect();
-    roll_out(data, problem, &chain, models, &data.range)
+    let fit = |out: &Vec<usize>| problem.coefficients(&chain, terms, ridge, out, refinement);
+    let models: Option<Vec<_>> = splits.iter().map(|out| Some((&out[..], fit(out)?))).collect();
+    roll_out((data, set), problem, &chain, models, &data.range)
 }
 
 /// Where a candidate, fitted without any one fold, fails in all windows, those of training included.
@@ -514,21 +630,24 @@ pub(crate) fn stress(
     problems: &[Problem<'_>],
     data: &Data,
     (frame, terms, ridge): &Model,
+    refinement: Option<Refinement<'_>>,
 ) -> Option<Rejection> {
     let problem = &problems[*frame];
     let chain = problem.chain(terms);
     (0..data.plan.folds()).find_map(|fold| {
-        let model = problem.coefficients(&chain, terms, f64::from_bits(*ridge), Some(fold));
-        roll_out(data, problem, &chain, model.map(|m| vec![m]), &data.range).err()
+        let ridge = f64::from_bits(*ridge);
+        let model = problem.coefficients(&chain, terms, ridge, &[fold], refinement);
+        let everywhere = model.map(|m| vec![(&[][..], m)]);
+        roll_out((data, &data.all), problem, &chain, everywhere, &data.range).err()
     })
 }
 
-/// Rolls a model, one or one for each fold, out over all windows.
+/// Rolls models out over all windows of the folds that they leave out, or of all: mean squared sums.
 pub(crate) fn roll_out(
-    data: &Data,
+    (data, set): (&Data, &WindowSet),
     problem: &Problem<'_>,
     chain: &Chain,
-    models: Option<Vec<Vec<f32>>>,
+    models: Option<Vec<Without<'_>>>,
     range: &[[f64; 2]],
 ) -> Outcome {
     let unfit = Rejection { windows: 0, trajectory: 0, row: 0, step: 0, state: None };
@@ -536,14 +655,18 @@ pub(crate) fn roll_out(
         return Err(unfit);
     };
     let mut rollout = Rollout::new(&structure, chain, range);
-    let mut sums = vec![vec![0.0; data.n]; data.steps.len()];
+    let mut sums = vec![vec![0.0; data.n]; set.steps.len()];
     let mut rejection: Option<Rejection> = None;
-    for window in &data.windows {
-        let model = models.get(window.fold).unwrap_or(&models[0]);
-        if let Err((step, state)) = rollout.run(data, window, model, &mut sums[window.unit]) {
-            let Window { trajectory, row, .. } = *window;
-            let first = Rejection { windows: 0, trajectory, row, step, state };
-            rejection.get_or_insert(first).windows += 1;
+    for window in &set.windows {
+        let scored = |(out, _): &&Without<'_>| out.is_empty() || out.contains(&window.fold);
+        let share = 1.0 / models.iter().filter(scored).count().max(1) as f64;
+        for (_, model) in models.iter().filter(scored) {
+            let to = &mut sums[window.unit];
+            if let Err((step, state)) = rollout.run(data, window, model, share, to) {
+                let Window { trajectory, row, .. } = *window;
+                let first = Rejection { windows: 0, trajectory, row, step, state };
+                rejection.get_or_insert(first).windows += 1;
+            }
         }
     }
     rejection.map_or(Ok(sums), Err)
@@ -584,12 +707,13 @@ impl<'r, 'a> Rollout<'r, 'a> {
         }
     }
 
-    /// Adds the squared errors of a window; the step and state where it fails otherwise.
+    /// Adds a share of the squared errors of a window; the step and state where it fails otherwise.
     pub(crate) fn run(
         &mut self,
         data: &Data,
         window: &Window,
         coefficients: &[f32],
+        share: f64,
         sums: &mut [f64],
     ) -> Result<(), (usize, Option<usize>)> {
         let (n, m) = (data.n, data.m);
@@ -628,7 +752,7 @@ impl<'r, 'a> Rollout<'r, 'a> {
                     Space::Line => f64::from(*p) - x,
                     Space::Circle => (f64::from(*p) - x).wrap(),
                 };
-                sums[i] += error * error;
+                sums[i] += share * error * error;
             }
         }
         Ok(())
