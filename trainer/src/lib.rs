@@ -9,6 +9,7 @@
 //! | [`chain`] | dictionaries that list their terms one by one |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
 //! | [`score`], [`arx`], [`unicycle`] | rollouts over windows beside no motion, a linear ARX and a unicycle |
+//! | [`rollout`] | rollouts in f64 or f32, and their errors over test logs |
 //! | [`select`], [`library`], [`cost`] | the search for the best rollout that fits a controller |
 //! | [`conformal`] | error bounds per state and step from held-out logs |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
@@ -42,6 +43,7 @@ pub mod report;
 pub mod reproduce;
 pub mod resample;
 pub mod robot;
+pub mod rollout;
 pub mod score;
 pub mod select;
 mod select_report;

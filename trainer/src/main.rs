@@ -21,6 +21,7 @@ use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
 use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
 use trainer::robot::{Method, Robot, ScoreOptions};
+use trainer::rollout::TestReport;
 use trainer::score::{self, Counts, Lifted};
 use trainer::select::{self, Budget};
 use trainer::spectrum_report::SpectrumReport;
@@ -62,6 +63,13 @@ struct FitArgs {
     /// Do not score: only read, fit and write.
     #[arg(long)]
     no_score: bool,
+    /// Also roll the model out over these logs, which it is not fitted on, from their first samples,
+    /// in f64 and in the controller's f32.
+    #[arg(long, value_name = "DIR")]
+    test: Option<PathBuf>,
+    /// Steps of these rollouts [default: as in robot.toml, or 50].
+    #[arg(long, value_name = "N", requires = "test", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    horizon: Option<u32>,
     /// Print JSON instead of text.
     #[arg(long)]
     json: bool,
@@ -321,6 +329,8 @@ struct FitReport<'r> {
     score: Option<ScoreReport>,
     /// Why there is no score.
     unscored: Option<String>,
+    /// Errors over the logs of --test.
+    test: Option<TestReport>,
 }
 
 #[derive(Serialize)]
@@ -372,6 +382,7 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
     }
     let recording = Recording::open(&logs)?;
     let source = Logs { recording: &recording, schema: &robot.schema };
+    let test = args.test.as_deref().map(Recording::open).transpose()?;
 
     let reading = bar("fitting", recording.bytes());
     let fitted = edmd::fit(&robot, &source, &|bytes| reading.set_position(bytes));
@@ -400,6 +411,14 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
             Err(error) => return Err(error.into()),
         }
     }
+    let test = match &test {
+        None => None,
+        Some(recording) => {
+            let test = collect(&Logs { recording, schema: &robot.schema })?;
+            let horizon = args.horizon.map_or(robot.score.horizon, |h| h as usize);
+            Some(TestReport::measure(&fitted, &test, horizon)?)
+        }
+    };
     write_whole(&out, |file| file.write_all(&bytes))?;
 
     let coefficients =
@@ -439,6 +458,7 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
         },
         score: report,
         unscored,
+        test,
     };
     if args.json { print_json(&report) } else { print(&fit_text(&report)) }
 }
@@ -488,6 +508,9 @@ fn fit_text(report: &FitReport<'_>) -> String {
     }
     if let Some(reason) = &report.unscored {
         text += &format!("\nnot scored: {reason}\n");
+    }
+    if let Some(test) = &report.test {
+        text += &format!("\ntest logs: {}", test.text());
     }
     text
 }
