@@ -25,8 +25,9 @@ use trainer::rollout::TestReport;
 use trainer::score::{self, Counts, Lifted};
 use trainer::select::{self, Budget};
 use trainer::spectrum_report::SpectrumReport;
+use trainer::stability::Stability;
 use trainer::topology::{Orders, lifting};
-use trainer::trajectory::{Logs, collect};
+use trainer::trajectory::{Logs, collect, collect_named};
 
 /// Fits Koopman models to robot logs and writes them as blobs that a microcontroller reads.
 #[derive(Parser)]
@@ -42,6 +43,7 @@ enum Command {
     Evaluate(EvaluateArgs),
     Inspect(InspectArgs),
     Calibrate(CalibrateArgs),
+    Stability(StabilityArgs),
     Select(SelectArgs),
     Spectrum(SpectrumArgs),
     Dictionary(DictionaryArgs),
@@ -125,6 +127,29 @@ struct CalibrateArgs {
     /// Where the blob with the bounds is written [default: in place].
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+}
+
+/// Tell whether a blob's predictions stay with the data: small deviations along the logs, and rollouts
+/// that diverge or leave the range.
+#[derive(Args)]
+struct StabilityArgs {
+    /// The blob.
+    model: PathBuf,
+    /// Folder of CSV logs, or one CSV file.
+    #[arg(long, value_name = "DIR")]
+    logs: PathBuf,
+    /// The robot.toml that names the columns [default: as for evaluate].
+    #[arg(long, value_name = "FILE")]
+    robot: Option<PathBuf>,
+    /// Steps of a rollout [default: as in robot.toml, or 50].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    horizon: Option<u32>,
+    /// Samples between the starts of two rollouts [default: as in robot.toml, or 10].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    stride: Option<u32>,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
 }
 
 /// Search the sparse model with the best rollouts that fits a controller's budget.
@@ -279,6 +304,7 @@ fn main() -> ExitCode {
         Command::Evaluate(args) => evaluate(&args),
         Command::Inspect(args) => show_blob(&args),
         Command::Calibrate(args) => calibrate(&args),
+        Command::Stability(args) => stability(&args),
         Command::Select(args) => select_model(&args),
         Command::Spectrum(args) => spectrum(&args),
         Command::Dictionary(args) => dictionary(&args),
@@ -785,6 +811,39 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
         );
     }
     print(&text)
+}
+
+/// `stability --json`.
+#[derive(Serialize)]
+struct StabilityReport<'r> {
+    format: u32,
+    command: &'static str,
+    robot: &'r str,
+    model: String,
+    logs: String,
+    #[serde(flatten)]
+    stability: Stability,
+}
+
+fn stability(args: &StabilityArgs) -> Result<(), Failure> {
+    let file = BlobFile::read(&args.model)?;
+    let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let place = (args.model.as_path(), args.robot.as_ref());
+    let (schema, options) = log_schema(place, (args.horizon, args.stride), &model)?;
+    let recording = Recording::open(&args.logs)?;
+    let logs = collect_named(&Logs { recording: &recording, schema: &schema })?;
+    let report = StabilityReport {
+        format: 1,
+        command: "stability",
+        robot: model.structure().robot(),
+        model: args.model.display().to_string(),
+        logs: args.logs.display().to_string(),
+        stability: Stability::measure(&model, &logs, &options)?,
+    };
+    if args.json {
+        return print_json(&report);
+    }
+    print(&format!("{} on {}\n{}", report.model, report.logs, report.stability.text()))
 }
 
 /// `inspect --json`.

@@ -63,7 +63,7 @@ pub fn observe<S: Real>(
 }
 
 /// The inputs of a row.
-fn input<S: Real>(trajectory: &Trajectory, inputs: usize, row: usize) -> Vec<S> {
+pub(crate) fn input<S: Real>(trajectory: &Trajectory, inputs: usize, row: usize) -> Vec<S> {
     trajectory.inputs[row * inputs..][..inputs].iter().map(|u| S::from_f64(*u)).collect()
 }
 
