@@ -380,23 +380,32 @@ impl Stability {
                 let _ = writeln!(text, "  {title}: none");
                 return;
             };
+            // As the controller has them; four digits where they tell the numbers apart.
+            let [low, high] = first.range;
+            let numbers = [first.value, low, high];
+            let short = numbers.map(significant);
+            let [value, low, high] = match short[1..].contains(&short[0]) {
+                true => numbers.map(|x| (x as f32).to_string()),
+                false => short,
+            };
+            let side = match first.range[0] <= first.value && first.value <= first.range[1] {
+                true => "within",
+                false => "outside",
+            };
             let _ = writeln!(
                 text,
-                "  {title}: {}; the first at {}, step {}: {words} `{}` was {}, outside {} to {}",
+                "  {title}: {}; the first at {}, step {}: {words} `{}` was {value}, {side} {low} to {high}",
                 watch.windows,
                 at(&first.place),
                 first.step,
-                first.what,
-                significant(first.value),
-                significant(first.range[0]),
-                significant(first.range[1])
+                first.what
             );
         };
         watch(
             &mut text,
             "diverged",
             &self.diverged,
-            "no finite prediction within the limits; before that,",
+            "no finite prediction within the limits; just before,",
         );
         watch(
             &mut text,
