@@ -97,6 +97,12 @@ struct RobotLogs {
     /// Without it: every digit, or with noise 6 (soft-leg 4).
     #[arg(long, value_name = "N")]
     digits: Option<u8>,
+    /// Inputs that are held all the time instead of random ones: 12.1369,6.7310 is the paper's circle
+    #[arg(long, value_name = "U1,U2", value_delimiter = ',', allow_hyphen_values = true)]
+    hold: Option<Vec<f64>>,
+    /// Where the rosbot starts (m, m, rad) [default: 0,0,0]
+    #[arg(long, value_name = "X,Y,PHI", value_delimiter = ',', allow_hyphen_values = true)]
+    start: Option<Vec<f64>>,
     /// Replace a recording that DIR already holds
     #[arg(long)]
     overwrite: bool,
@@ -130,10 +136,18 @@ fn run(arguments: Arguments) -> Result<(), Box<dyn Error>> {
                 noise,
                 integrator,
                 digits,
+                hold,
+                start,
                 overwrite,
             } = robot.expect("clap asks for a robot where no set is named");
             let settings = Settings { robot, trials, seconds, seed, noise, integrator, digits };
-            let recording = Recording::new(settings)?;
+            let mut recording = Recording::new(settings)?;
+            if let Some(input) = hold {
+                recording = recording.held(&input)?;
+            }
+            if let Some(pose) = start {
+                recording = recording.starting_at(&pose)?;
+            }
             recording.write(&out, overwrite)?;
             writeln!(std::io::stdout(), "{recording}, in {}", out.display())?;
         }

@@ -12,8 +12,9 @@
 //! The first two are the paper's training data. 20 Hz for the leg puts at least two samples into
 //! the fastest lag that its tip shows (0.1 s), while the 30 ms of its valves stay below a sample.
 //!
-//! Every trial starts where a new plant does: the ROSbot at the origin, the arm at rest stretched
-//! out horizontally (θ = 0, where the paper's test begins too), the leg idle.
+//! Every trial starts where a new plant does: the ROSbot at the origin (or where it is
+//! [put](Recording::starting_at)), the arm at rest stretched out horizontally (θ = 0, where the paper's
+//! test begins too), the leg idle. One input can be [held](Recording::held) instead of random ones.
 //!
 //! - The input in a row acts from that row's time to the next row's; the last row holds the input
 //!   that would act next. There is one row more than there are whole samples in the duration.
@@ -183,6 +184,22 @@ pub enum SettingsError {
         /// What was given.
         digits: u8,
     },
+    /// Too few or too many numbers, or one that is not finite.
+    #[error("expected {expected} finite numbers for the {what}, found {found}")]
+    Numbers {
+        /// What they are.
+        what: &'static str,
+        /// How many it has.
+        expected: usize,
+        /// How many were finite numbers.
+        found: usize,
+    },
+    /// The robot always starts at rest at the same place.
+    #[error("{robot} cannot start elsewhere; only the rosbot can")]
+    Start {
+        /// The robot.
+        robot: Robot,
+    },
     /// The robot cannot be integrated like this.
     #[error("{robot} cannot be integrated with {integrator}: use {}", integrators(*robot))]
     Integrator {
@@ -197,6 +214,19 @@ pub enum SettingsError {
 const MOST_SAMPLES: u32 = 100_000_000;
 /// Decimal digits that every f64 keeps.
 const MOST_DIGITS: u8 = 15;
+
+fn expect_numbers(
+    what: &'static str,
+    numbers: &[f64],
+    expected: usize,
+) -> Result<(), SettingsError> {
+    let found = numbers.iter().filter(|x| x.is_finite()).count();
+    if found == expected && numbers.len() == expected {
+        Ok(())
+    } else {
+        Err(SettingsError::Numbers { what, expected, found })
+    }
+}
 
 fn integrators(robot: Robot) -> &'static str {
     match robot {
@@ -244,6 +274,7 @@ pub struct Recording {
     plant: AnyPlant,
     integrator: Integrator,
     samples: u32,
+    held: Option<Vec<f64>>,
 }
 
 impl Recording {
@@ -290,7 +321,53 @@ impl Recording {
             _ => None,
         };
         let plant = plant.ok_or(SettingsError::Integrator { robot, integrator })?;
-        Ok(Self { settings, plant, integrator, samples: samples as u32 })
+        Ok(Self { settings, plant, integrator, samples: samples as u32, held: None })
+    }
+
+    /// The same with one input, in the robot's units, held all the time instead of random ones.
+    ///
+    /// # Errors
+    ///
+    /// [`SettingsError::Numbers`] unless there is one finite number per input.
+    ///
+    /// ```
+    /// use firmware_sim::record::{Recording, Robot, Settings};
+    ///
+    /// let settings = Settings {
+    ///     robot: Robot::Rosbot,
+    ///     trials: 1,
+    ///     seconds: 0.1,
+    ///     seed: 1,
+    ///     noise: 0.0,
+    ///     integrator: None,
+    ///     digits: None,
+    /// };
+    /// let recording = Recording::new(settings)?.held(&[10.0, 10.0])?.starting_at(&[1000.0, 2.0, 0.0])?;
+    /// let mut csv = Vec::new();
+    /// recording.write_trial(0, &mut csv)?;
+    /// assert!(String::from_utf8(csv)?.ends_with("\n0,1000,2,0,10,10\n0.1,1000.062,2,0,10,10\n"));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn held(mut self, input: &[f64]) -> Result<Self, SettingsError> {
+        expect_numbers("inputs", input, 2)?;
+        self.held = Some(input.to_owned());
+        Ok(self)
+    }
+
+    /// The same with every trial starting at a pose (x, y in m, heading in rad) instead of the
+    /// origin. Where a drive stands does not change its motion, only the digits that are left for it.
+    ///
+    /// # Errors
+    ///
+    /// [`SettingsError::Start`] for a robot that is not a drive, [`SettingsError::Numbers`] unless
+    /// there are three finite numbers.
+    pub fn starting_at(mut self, pose: &[f64]) -> Result<Self, SettingsError> {
+        let AnyPlant::Drive(drive) = &mut self.plant else {
+            return Err(SettingsError::Start { robot: self.settings.robot });
+        };
+        expect_numbers("start", pose, 3)?;
+        drive.set_pose([pose[0], pose[1], pose[2]]);
+        Ok(self)
     }
 
     /// Rows of every file: one per sample and one more.
@@ -335,8 +412,11 @@ impl Recording {
             std: usual.std.map(|std| noise * std),
             decimals: digits.or(usual.decimals.filter(|_| noise > 0.0)),
         };
-        let inputs =
-            iter::repeat_with(|| excitation.next(&mut input_rng)).take(self.rows() as usize);
+        let inputs = iter::repeat_with(|| match &self.held {
+            Some(held) => std::array::from_fn(|i| held[i]),
+            None => excitation.next(&mut input_rng),
+        });
+        let inputs = inputs.take(self.rows() as usize);
         let rate_hz = robot.rate_hz();
         let rows = rows(plant.clone(), rate_hz, inputs, sensor, noise_rng);
         write_csv(out, &plant, rate_hz, rows)

@@ -202,7 +202,7 @@ fn impossible_settings_are_refused_with_the_reason_and_no_output() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("logs");
     let out = out.to_str().unwrap();
-    let cases: [(&str, &[&str], &str); 13] = [
+    let cases: [(&str, &[&str], &str); 17] = [
         (
             "hexapod",
             &[],
@@ -224,6 +224,10 @@ fn impossible_settings_are_refused_with_the_reason_and_no_output() {
             "cannot be integrated with exact: use rk4 or euler",
         ),
         ("soft-leg", &["--integrator", "euler"], "cannot be integrated with euler:1: use rk4"),
+        ("rosbot", &["--hold", "1"], "expected 2 finite numbers for the inputs, found 1"),
+        ("rosbot", &["--hold", "1,NaN"], "expected 2 finite numbers for the inputs, found 1"),
+        ("rosbot", &["--start", "1,2,3,4"], "expected 3 finite numbers for the start, found 4"),
+        ("soft-leg", &["--start", "1,2,3"], "soft-leg cannot start elsewhere; only the rosbot can"),
     ];
     for (robot, changed, reason) in cases {
         let mut arguments = vec!["record", robot, "--out", out];
@@ -306,6 +310,29 @@ fn logs_can_be_read_by_others() {
 }
 
 #[test]
+fn an_input_can_be_held_and_the_drive_put_somewhere() {
+    let dir = tempfile::tempdir().unwrap();
+    let (circle, far) = (dir.path().join("circle"), dir.path().join("far"));
+    let hold = ["--hold", "12.1369,6.7310"];
+    record("rosbot", &circle, &hold);
+    record("rosbot", &far, &[&hold[..], &["--start", "1000,-2,0"]].concat());
+    let numbers = |dir: &Path| -> Vec<Vec<f64>> {
+        let parse = |line: &str| line.split(',').map(|x| x.parse().unwrap()).collect();
+        text(dir, 0).lines().skip(1).map(parse).collect()
+    };
+    // Half a unit in the last place of 1 km, once a row.
+    const ROUNDING: f64 = 1e-12;
+    for (here, there) in numbers(&circle).iter().zip(numbers(&far)) {
+        assert_eq!(here[4..], [12.1369, 6.731]);
+        assert_eq!((here[3], &here[4..]), (there[3], &there[4..]));
+        assert!((here[1] + 1000.0 - there[1]).abs() < ROUNDING);
+        assert!((here[2] - 2.0 - there[2]).abs() < ROUNDING);
+    }
+    record("soft-leg", &dir.path().join("leg"), &["--hold", "-3,4.5"]);
+    assert!(text(&dir.path().join("leg"), 1).lines().skip(1).all(|line| line.ends_with(",-3,4.5")));
+}
+
+#[test]
 fn help_names_every_robot_and_option() {
     let output = firmware_sim(&["record", "--help"]);
     assert!(output.status.success());
@@ -321,6 +348,8 @@ fn help_names_every_robot_and_option() {
         "--noise",
         "--integrator",
         "--digits",
+        "--hold",
+        "--start",
         "--overwrite",
     ] {
         assert!(help.contains(word), "{word}");

@@ -486,7 +486,8 @@ fn methods_and_column_scaling_agree_where_nothing_is_exact() {
         for (method, scale_columns) in
             METHODS.into_iter().flat_map(|m| scalings.iter().map(move |s| (m, *s)))
         {
-            robot.fit = FitOptions { method, scale_columns, ridge, truncation: 1e-14, refine: None };
+            robot.fit =
+                FitOptions { method, scale_columns, ridge, truncation: 1e-14, refine: None };
             let found = fit(&robot, &training).operator;
             let difference = difference(&reference.matrix, &found.matrix, found.outputs);
             println!("{method:?}, scaled {scale_columns}, ridge {ridge}: {difference:.1e}");

@@ -228,6 +228,71 @@ fn rank(units: usize, coverage: f64) -> usize {
     libm::ceil((units + 1) as f64 * coverage - ROUNDING) as usize
 }
 
+/// The probability of every number of `test` units, 0 to all, within a bound from `calibration`
+/// others; `None` where there is no bound.
+///
+/// The bound is the r-th of n exchangeable errors, so that the number is beta-binomial with the
+/// parameters r and n + 1 − r, whatever the distribution of the errors (Vovk 2012, "Conditional
+/// validity of inductive conformal predictors").
+///
+/// ```
+/// use trainer::conformal::chance;
+/// // The largest of 9: one more is within it with 9/10, both of two with 9/11.
+/// let one = chance(9, 1, 0.9).unwrap();
+/// assert!((one[0] - 0.1).abs() < 1e-15 && (one[1] - 0.9).abs() < 1e-15);
+/// assert!((chance(9, 2, 0.9).unwrap()[2] - 9.0 / 11.0).abs() < 1e-15);
+/// assert_eq!(chance(8, 1, 0.9), None);
+/// ```
+pub fn chance(calibration: usize, test: usize, coverage: f64) -> Option<Vec<f64>> {
+    if calibration < least_units(coverage).ok()? {
+        return None;
+    }
+    let rank = rank(calibration, coverage);
+    let (a, b, n) = (rank as f64, (calibration + 1 - rank) as f64, test as f64);
+    // Logarithms from p(k + 1)/p(k), the largest taken out: nothing under- or overflows.
+    let mut logarithms = vec![0.0; test + 1];
+    for k in 0..test {
+        let x = k as f64;
+        let ratio = (n - x) * (x + a) / ((x + 1.0) * (n - x - 1.0 + b));
+        logarithms[k + 1] = logarithms[k] + libm::log(ratio);
+    }
+    let largest = logarithms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let masses: Vec<f64> = logarithms.iter().map(|l| libm::exp(l - largest)).collect();
+    let sum: f64 = masses.iter().sum();
+    Some(masses.iter().map(|mass| mass / sum).collect())
+}
+
+/// The shares of `test` units between which a cell lies with a probability of at least `probability`
+/// by [`chance`] alone; what is left out is split evenly between the two ends.
+///
+/// ```
+/// use trainer::conformal::chance_range;
+/// // 1,000 and 1,000 units: a standard deviation of 1.3 %.
+/// assert_eq!(chance_range(1000, 1000, 0.9, 0.95), Some([0.873, 0.925]));
+/// // Calibrated on plenty, the test alone decides: 0.9 ± 1.96 · 0.0095.
+/// assert_eq!(chance_range(1_000_000, 1000, 0.9, 0.95), Some([0.881, 0.918]));
+/// ```
+pub fn chance_range(
+    calibration: usize,
+    test: usize,
+    coverage: f64,
+    probability: f64,
+) -> Option<[f64; 2]> {
+    let masses = chance(calibration, test, coverage)?;
+    let tail = (1.0 - probability) / 2.0;
+    // Numbers from one end on that the tail leaves out.
+    let left_out = |masses: &mut dyn Iterator<Item = &f64>| {
+        let mut sum = 0.0;
+        let within = masses.take_while(|mass| {
+            sum += **mass;
+            sum <= tail
+        });
+        within.count()
+    };
+    let (low, high) = (left_out(&mut masses.iter()), left_out(&mut masses.iter().rev()));
+    (test > 0).then(|| [low, test - high].map(|k| k as f64 / test as f64))
+}
+
 /// A blob with its error bounds replaced.
 ///
 /// # Errors
@@ -275,7 +340,12 @@ pub struct CoverageReport {
     pub worst_step: usize,
     /// Its coverage.
     pub worst: f64,
+    /// Where chance alone puts 19 of 20 cells, for units that are whole trajectories.
+    pub chance: Option<[f64; 2]>,
 }
+
+/// Share of the cells that lie in [`CoverageReport::chance`].
+const USUAL: f64 = 0.95;
 
 impl CoverageReport {
     /// `None` when no step has a bound.
@@ -304,18 +374,32 @@ impl CoverageReport {
             worst_state: names.get(cell % residuals.states).map_or("?", |n| n).to_owned(),
             worst_step: cell / residuals.states + 1,
             worst,
+            // Blocks of one trajectory depend on each other: no theory says how far apart they lie.
+            chance: (residuals.unit == Unit::Trajectory)
+                .then(|| {
+                    let calibration = bounds.units() as usize;
+                    chance_range(calibration, residuals.units(), nominal, USUAL)
+                })
+                .flatten(),
         })
     }
 
-    /// Two lines.
+    /// Two or three lines.
     pub fn text(&self) -> String {
         let unit = match self.unit {
             Unit::Trajectory => "trajectories",
             Unit::Block => "contiguous blocks",
         };
+        let chance = self.chance.map_or_else(String::new, |[low, high]| {
+            format!(
+                "With these numbers of units, chance alone puts 19 of 20 cells between {:.1} % and {:.1} %.\n",
+                100.0 * low,
+                100.0 * high
+            )
+        });
         format!(
             "Error bounds for {:.1} % from {} units: on {} {unit}, {:.1} % to {:.1} % are within them \
-             ({} cells of state and step, mean {:.1} %).\nFarthest off: {} at step {}, {:.1} %.\n",
+             ({} cells of state and step, mean {:.1} %).\nFarthest off: {} at step {}, {:.1} %.\n{chance}",
             100.0 * self.nominal,
             self.calibration_units,
             self.units,

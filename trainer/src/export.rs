@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use firmware_core::Scalar;
 use firmware_core::blob::{self, EmitError};
 use firmware_core::capacity::{MAX_LAG, MAX_ORDER};
 use firmware_core::dictionary::{Basis, Dictionary, block_size};
@@ -71,8 +72,8 @@ fn to_powers(block: &mut [f64], radix: usize, after: usize) {
     }
 }
 
-/// The coefficients of a model as the core has them: of a dense one, or of the terms of a chain.
-pub fn model_coefficients(
+/// The coefficients of a model: of a dense one, or of the terms of a chain.
+pub fn coefficients(
     dictionary: &Dictionary,
     chain: Option<&Chain>,
     operator: &Operator,
@@ -83,25 +84,26 @@ pub fn model_coefficients(
     }
 }
 
-/// [`model_coefficients`] in f32, as in the blob.
+/// The same in the f32 of the blob.
 pub fn controller_coefficients(
     dictionary: &Dictionary,
     chain: Option<&Chain>,
     operator: &Operator,
 ) -> Vec<f32> {
-    model_coefficients(dictionary, chain, operator).into_iter().map(|c| c as f32).collect()
+    coefficients(dictionary, chain, operator).into_iter().map(|c| c as f32).collect()
 }
 
-/// The model of a structure with the coefficients of [`controller_coefficients`].
+/// The model of a structure with the coefficients of [`controller_coefficients`], or of
+/// [`coefficients`] for a model in f64.
 ///
 /// # Errors
 /// [`ModelError`].
-pub fn controller_model<'m>(
+pub fn controller_model<'m, S: Scalar>(
     structure: Structure<'m>,
     chain: Option<&'m Chain>,
-    coefficients: &'m [f32],
-    ranges: Option<&'m [f32]>,
-) -> Result<Model<'m>, ModelError> {
+    coefficients: &'m [S],
+    ranges: Option<&'m [S]>,
+) -> Result<Model<'m, S>, ModelError> {
     match chain {
         Some(chain) => Model::new_sparse(structure, chain.entries(), coefficients, ranges),
         None => Model::new(structure, coefficients, ranges),
@@ -155,7 +157,6 @@ pub fn export(fit: &Fit<'_>) -> Result<Vec<u8>, ExportError> {
 
 /// A coordinate as the controller gets it: angles are wrapped before they lose digits to f32.
 pub fn coordinate(x: f64, space: Space) -> f32 {
-    use firmware_core::Scalar;
     match space {
         Space::Line => x as f32,
         Space::Circle => x.wrap() as f32,

@@ -9,8 +9,10 @@
 //! | [`chain`] | dictionaries that list their terms one by one |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
 //! | [`score`], [`arx`], [`unicycle`] | rollouts over windows beside no motion, a linear ARX and a unicycle |
+//! | [`rollout`] | rollouts in f64 or f32, and their errors over test logs |
 //! | [`select`], [`library`], [`cost`] | the search for the best rollout that fits a controller |
 //! | [`conformal`] | error bounds per state and step from held-out logs |
+//! | [`stability`] | the model linearised along the data; where rollouts leave the data |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
 //! | [`forecast`], [`koopman`], [`hermite`], [`edmd_dl`], [`sindy`] | one interface for every method, the methods |
 //! | [`reproduce`], [`convergence`], [`figures`], [`plot`] | the paper's experiments, tables and figures |
@@ -43,6 +45,7 @@ pub mod report;
 pub mod reproduce;
 pub mod resample;
 pub mod robot;
+pub mod rollout;
 pub mod score;
 pub mod select;
 mod select_report;
@@ -52,6 +55,7 @@ pub mod solve;
 mod sparse_fit;
 pub mod spectrum;
 pub mod spectrum_report;
+pub mod stability;
 pub mod terms;
 pub mod topology;
 pub mod trajectory;

@@ -21,11 +21,13 @@ use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
 use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
 use trainer::robot::{Method, Robot, ScoreOptions};
+use trainer::rollout::TestReport;
 use trainer::score::{self, Counts, Lifted};
 use trainer::select::{self, Budget};
 use trainer::spectrum_report::SpectrumReport;
+use trainer::stability::Stability;
 use trainer::topology::{Orders, lifting};
-use trainer::trajectory::{Logs, collect};
+use trainer::trajectory::{Logs, collect, collect_named};
 
 /// Fits Koopman models to robot logs and writes them as blobs that a microcontroller reads.
 #[derive(Parser)]
@@ -41,6 +43,7 @@ enum Command {
     Evaluate(EvaluateArgs),
     Inspect(InspectArgs),
     Calibrate(CalibrateArgs),
+    Stability(StabilityArgs),
     Select(SelectArgs),
     Spectrum(SpectrumArgs),
     Dictionary(DictionaryArgs),
@@ -62,6 +65,13 @@ struct FitArgs {
     /// Do not score: only read, fit and write.
     #[arg(long)]
     no_score: bool,
+    /// Also roll the model out over these logs, which it is not fitted on, from their first samples,
+    /// in f64 and in the controller's f32.
+    #[arg(long, value_name = "DIR")]
+    test: Option<PathBuf>,
+    /// Steps of these rollouts [default: as in robot.toml, or 50].
+    #[arg(long, value_name = "N", requires = "test", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    horizon: Option<u32>,
     /// Print JSON instead of text.
     #[arg(long)]
     json: bool,
@@ -117,6 +127,29 @@ struct CalibrateArgs {
     /// Where the blob with the bounds is written [default: in place].
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+}
+
+/// Tell whether a blob's predictions stay with the data: small deviations along the logs, and rollouts
+/// that diverge or leave the range.
+#[derive(Args)]
+struct StabilityArgs {
+    /// The blob.
+    model: PathBuf,
+    /// Folder of CSV logs, or one CSV file.
+    #[arg(long, value_name = "DIR")]
+    logs: PathBuf,
+    /// The robot.toml that names the columns [default: as for evaluate].
+    #[arg(long, value_name = "FILE")]
+    robot: Option<PathBuf>,
+    /// Steps of a rollout [default: as in robot.toml, or 50].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    horizon: Option<u32>,
+    /// Samples between the starts of two rollouts [default: as in robot.toml, or 10].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    stride: Option<u32>,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
 }
 
 /// Search the sparse model with the best rollouts that fits a controller's budget.
@@ -271,6 +304,7 @@ fn main() -> ExitCode {
         Command::Evaluate(args) => evaluate(&args),
         Command::Inspect(args) => show_blob(&args),
         Command::Calibrate(args) => calibrate(&args),
+        Command::Stability(args) => stability(&args),
         Command::Select(args) => select_model(&args),
         Command::Spectrum(args) => spectrum(&args),
         Command::Dictionary(args) => dictionary(&args),
@@ -321,6 +355,8 @@ struct FitReport<'r> {
     score: Option<ScoreReport>,
     /// Why there is no score.
     unscored: Option<String>,
+    /// Errors over the logs of --test.
+    test: Option<TestReport>,
 }
 
 #[derive(Serialize)]
@@ -372,6 +408,7 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
     }
     let recording = Recording::open(&logs)?;
     let source = Logs { recording: &recording, schema: &robot.schema };
+    let test = args.test.as_deref().map(Recording::open).transpose()?;
 
     let reading = bar("fitting", recording.bytes());
     let fitted = edmd::fit(&robot, &source, &|bytes| reading.set_position(bytes));
@@ -400,6 +437,14 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
             Err(error) => return Err(error.into()),
         }
     }
+    let test = match &test {
+        None => None,
+        Some(recording) => {
+            let test = collect(&Logs { recording, schema: &robot.schema })?;
+            let horizon = args.horizon.map_or(robot.score.horizon, |h| h as usize);
+            Some(TestReport::measure(&fitted, &test, horizon)?)
+        }
+    };
     write_whole(&out, |file| file.write_all(&bytes))?;
 
     let coefficients =
@@ -439,6 +484,7 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
         },
         score: report,
         unscored,
+        test,
     };
     if args.json { print_json(&report) } else { print(&fit_text(&report)) }
 }
@@ -488,6 +534,9 @@ fn fit_text(report: &FitReport<'_>) -> String {
     }
     if let Some(reason) = &report.unscored {
         text += &format!("\nnot scored: {reason}\n");
+    }
+    if let Some(test) = &report.test {
+        text += &format!("\ntest logs: {}", test.text());
     }
     text
 }
@@ -762,6 +811,39 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
         );
     }
     print(&text)
+}
+
+/// `stability --json`.
+#[derive(Serialize)]
+struct StabilityReport<'r> {
+    format: u32,
+    command: &'static str,
+    robot: &'r str,
+    model: String,
+    logs: String,
+    #[serde(flatten)]
+    stability: Stability,
+}
+
+fn stability(args: &StabilityArgs) -> Result<(), Failure> {
+    let file = BlobFile::read(&args.model)?;
+    let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let place = (args.model.as_path(), args.robot.as_ref());
+    let (schema, options) = log_schema(place, (args.horizon, args.stride), &model)?;
+    let recording = Recording::open(&args.logs)?;
+    let logs = collect_named(&Logs { recording: &recording, schema: &schema })?;
+    let report = StabilityReport {
+        format: 1,
+        command: "stability",
+        robot: model.structure().robot(),
+        model: args.model.display().to_string(),
+        logs: args.logs.display().to_string(),
+        stability: Stability::measure(&model, &logs, &options)?,
+    };
+    if args.json {
+        return print_json(&report);
+    }
+    print(&format!("{} on {}\n{}", report.model, report.logs, report.stability.text()))
 }
 
 /// `inspect --json`.

@@ -19,7 +19,7 @@ use firmware_core::{Predictor, PredictorState, Scalar};
 
 use crate::chain::Chain;
 use crate::edmd::Operator;
-use crate::export::model_coefficients;
+use crate::export::coefficients;
 use crate::recording::Visitor;
 use crate::robot::ScoreOptions;
 use crate::score::{Plan, Rows};
@@ -477,7 +477,7 @@ pub fn refine_operator(
     let expand = |matrix: &[f64]| {
         let mut moved = plain.clone();
         moved.matrix.copy_from_slice(matrix);
-        model_coefficients(structure.dictionary(), chain, &moved)
+        coefficients(structure.dictionary(), chain, &moved)
     };
     let shape = Shape { structure, entries: chain.map(Chain::entries), expand: &expand };
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

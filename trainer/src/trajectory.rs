@@ -74,13 +74,21 @@ impl Trajectories for InMemory<'_> {
 /// # Errors
 /// The source's own.
 pub fn collect<T: Trajectories>(source: &T) -> Result<Vec<Trajectory>, T::Error> {
-    struct Collector(Vec<Trajectory>);
+    Ok(collect_named(source)?.into_iter().map(|(_, trajectory)| trajectory).collect())
+}
+
+/// The same with the name of each.
+///
+/// # Errors
+/// The source's own.
+pub fn collect_named<T: Trajectories>(source: &T) -> Result<Vec<(String, Trajectory)>, T::Error> {
+    struct Collector(Vec<(String, Trajectory)>);
     impl Visitor for Collector {
-        fn begin(&mut self, _: &str) {
-            self.0.push(Trajectory::default());
+        fn begin(&mut self, name: &str) {
+            self.0.push((name.to_owned(), Trajectory::default()));
         }
         fn row(&mut self, states: &[f64], inputs: &[f64]) {
-            if let Some(last) = self.0.last_mut() {
+            if let Some((_, last)) = self.0.last_mut() {
                 last.states.extend_from_slice(states);
                 last.inputs.extend_from_slice(inputs);
             }

@@ -85,7 +85,10 @@ fn fit_reports_what_it_did() {
     assert!(text.contains(&format!("model: ./model.bin, {bytes} bytes, 192 of them")), "{text}");
 
     let report = json(&workshop.succeed(&["fit", ".", "--json"]));
-    has_fields(&report, &["format", "command", "robot", "model", "fit", "score", "unscored"]);
+    has_fields(
+        &report,
+        &["format", "command", "robot", "model", "fit", "score", "test", "unscored"],
+    );
     assert_eq!((&report["format"], &report["command"]), (&1.into(), &"fit".into()));
     assert_eq!(report["robot"], "cart");
     let model = &report["model"];
@@ -535,6 +538,7 @@ fn mistakes_on_the_command_line() {
         "resample",
         "reproduce",
         "calibrate",
+        "stability",
     ] {
         let help = workshop.succeed(&[command, "--help"]);
         assert!(help.contains(&format!("Usage: trainer {command}")), "{help}");
