@@ -8,7 +8,7 @@ use firmware_core::model::{ModelError, Provenance, Space, Structure};
 use crate::chain::Chain;
 use crate::gram::{GramAccumulator, NormalEquations};
 use crate::recording::{Summary, Visitor};
-use crate::refine::{Collected, refine_operator};
+use crate::refine::{Collected, Refined, refine_operator};
 use crate::robot::{FitOptions, Method, Robot, Scaling};
 use crate::score::Plan;
 use crate::snapshots::{PairSink, Snapshots};
@@ -378,6 +378,8 @@ pub struct Fit<'r> {
     pub chain: Option<&'r Chain>,
     /// F.
     pub operator: Operator,
+    /// How F was refined, if that was asked for.
+    pub refined: Option<Refined>,
     /// Smallest and largest raw value of every observable, shape `[observables, 2]`.
     pub ranges: Vec<f32>,
     /// A snapshot from the data: coordinates at the lags and the present sample, oldest first, and
@@ -391,8 +393,8 @@ pub struct Fit<'r> {
 
 /// Fits the robot's operator to all its trajectories.
 ///
-/// One pass over the data, two when the dictionary is standardised; memory does not grow with
-/// either.
+/// One pass over the data, two when the dictionary is standardised, two more when the operator is
+/// refined by its rollouts; memory does not grow with them.
 ///
 /// # Errors
 /// [`FitError`].
@@ -428,10 +430,12 @@ pub fn fit<'r, T: Trajectories>(
         return Err(FitError::TooLarge { observable });
     }
     let mut operator = solve_named(robot, &structure, regression)?;
+    let mut refined = None;
     if let Some(kappa) = robot.fit.refine {
         let collected = Collected::read(trajectories, &structure, &Plan::All, &robot.score);
         let collected = collected.map_err(FitError::Trajectories)?;
-        refine_operator(&structure, chain, &mut operator, &collected.of(0), kappa);
+        let windows = collected.of(0);
+        refined = Some(refine_operator(&structure, chain, &mut operator, &windows, kappa));
     }
 
     let mut limits = robot.limits();
@@ -448,6 +452,7 @@ pub fn fit<'r, T: Trajectories>(
         structure,
         chain: robot.chain.as_ref(),
         operator,
+        refined,
         ranges,
         example: example.take(),
         spread,

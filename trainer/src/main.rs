@@ -379,6 +379,9 @@ struct OperatorReport {
     scale_columns: bool,
     ridge: f64,
     truncation: f64,
+    refine: Option<f64>,
+    refinement_windows: usize,
+    refinement_steps: usize,
     trajectories: usize,
     rows: u64,
     pairs: u64,
@@ -476,6 +479,9 @@ fn fit(args: &FitArgs) -> Result<(), Failure> {
             scale_columns: options.scale_columns,
             ridge: options.ridge,
             truncation: options.truncation,
+            refine: options.refine,
+            refinement_windows: fitted.refined.map_or(0, |r| r.windows),
+            refinement_steps: fitted.refined.map_or(0, |r| r.steps),
             trajectories: fitted.summary.trajectories,
             rows: fitted.summary.rows,
             pairs: fitted.operator.pairs,
@@ -515,9 +521,19 @@ fn fit_text(report: &FitReport<'_>) -> String {
     if model.blocks.len() > SHOWN {
         text += &format!("  and {} more blocks\n", model.blocks.len() - SHOWN);
     }
+    let refined = match (fit.refine, fit.refinement_windows, fit.refinement_steps) {
+        (None, ..) => String::new(),
+        (Some(_), 0, _) => "not refined: no window of the horizon in the logs\n".to_owned(),
+        (Some(_), _, 0) => "not refined: a rollout diverges, or no step gains\n".to_owned(),
+        (Some(kappa), windows, steps) => {
+            format!(
+                "refined by the rollouts of {windows} windows, held by {kappa}, in {steps} steps\n"
+            )
+        }
+    };
     text += &format!(
         "fit: {}, {scaled}, ridge {}{truncation}; numerical rank {} of {}, condition number {}\n\
-         model: {}, {} bytes, {} of them coefficients ({} of {} zero)\n",
+         {refined}model: {}, {} bytes, {} of them coefficients ({} of {} zero)\n",
         fit.method,
         fit.ridge,
         fit.rank,

@@ -52,6 +52,17 @@ pub struct Window<'w> {
     pub inputs: &'w [f64],
 }
 
+/// What a refinement did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Refined {
+    /// How firmly the one-step fit held.
+    pub kappa: f64,
+    /// Windows looked at.
+    pub windows: usize,
+    /// Gauss-Newton steps that were of use; 0 without windows, and where one of them diverges.
+    pub steps: usize,
+}
+
 /// From the matrix of an [`Operator`], shape `[terms, outputs]`, to the model's coefficients.
 pub type Expand<'e> = dyn Fn(&[f64]) -> Vec<f64> + Sync + 'e;
 
@@ -472,7 +483,7 @@ pub fn refine_operator(
     operator: &mut Operator,
     windows: &[Window<'_>],
     kappa: f64,
-) -> usize {
+) -> Refined {
     let plain = operator.clone();
     let expand = |matrix: &[f64]| {
         let mut moved = plain.clone();
@@ -481,7 +492,8 @@ pub fn refine_operator(
     };
     let shape = Shape { structure, entries: chain.map(Chain::entries), expand: &expand };
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    refine(shape, &mut operator.matrix, windows, kappa, threads)
+    let steps = refine(shape, &mut operator.matrix, windows, kappa, threads);
+    Refined { kappa, windows: windows.len(), steps }
 }
 
 #[cfg(test)]

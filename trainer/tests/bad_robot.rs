@@ -69,6 +69,7 @@ fn names_and_ranges() {
     refused("unit = \"m\"", "limit = [5, 1]", &["states[0].limit", "low < high"]);
     refused("\"rad\"", "\"turns\"", &["states[1].unit", "`rad` or `deg`"]);
     refused("[score]", "[fit]\nridge = -1\n[score]", &["fit.ridge", "0 or more"]);
+    refused("[score]", "[fit]\nrefine = -0.1\n[score]", &["fit.refine", "0 or more"]);
     refused("[score]", "[fit]\ntruncation = nan\n[score]", &["fit.truncation", "0 or more"]);
     refused("[score]", "[fit]\ntruncation = 1\n[score]", &["fit.truncation", "below 1"]);
 }

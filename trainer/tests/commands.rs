@@ -125,6 +125,9 @@ fn fit_reports_what_it_did() {
             "scale_columns",
             "ridge",
             "truncation",
+            "refine",
+            "refinement_windows",
+            "refinement_steps",
             "trajectories",
             "rows",
             "pairs",
@@ -607,6 +610,35 @@ standardise = false
     assert!(scored.contains("x [m]"), "{scored}");
     let message = workshop.refuse(&["spectrum", "."]);
     assert!(message.contains("cart has no spectrum") && message.contains("blocks"), "{message}");
+}
+
+#[test]
+fn a_refined_fit_says_so_and_repeats_to_the_bit() {
+    let workshop = Workshop::new();
+    workshop.describe(
+        "[score]",
+        "[dictionary]\nterms = [\"x\", \"u\", \"sin(phi)\"]\n[fit]\nrefine = 0.1\n[score]",
+    );
+    let text = workshop.succeed(&["fit", "."]);
+    assert!(text.contains("refined by the rollouts of") && text.contains("held by 0.1"), "{text}");
+    let blob = workshop.read("model.bin");
+    workshop.succeed(&["fit", "."]);
+    assert_eq!(workshop.read("model.bin"), blob);
+
+    // The rollouts of the refined operator are better than those of the one-step fit.
+    let nrmse = |workshop: &Workshop| {
+        let report = json(&workshop.succeed(&["fit", ".", "--json"]));
+        report["score"]["contenders"][0]["nrmse"].as_f64().unwrap()
+    };
+    let refined = nrmse(&workshop);
+    workshop.describe("[score]", "[dictionary]\nterms = [\"x\", \"u\", \"sin(phi)\"]\n[score]");
+    let one_step = nrmse(&workshop);
+    assert!(refined < one_step, "{refined} {one_step}");
+
+    // Logs too short for a window of the horizon.
+    workshop.describe("[score]\nhorizon = 10", "[fit]\nrefine = 0.1\n[score]\nhorizon = 1000");
+    let text = workshop.succeed(&["fit", "."]);
+    assert!(text.contains("not refined: no window"), "{text}");
 }
 
 #[test]
