@@ -28,12 +28,19 @@ use heapless::Vec;
 // Sizes of a checked dictionary are small numbers: the wrapping arithmetic below never wraps, and is
 // there because it cannot panic.
 
-use crate::capacity::{MAX_BASIS, MAX_BLOCK_FACTORS, MAX_FUNCTIONS, MAX_SPARSE_TERMS};
-use crate::dictionary::{Basis, Factor, basis_functions, block_size, observable_pair, turn};
+use crate::capacity::{
+    MAX_BASIS, MAX_BLOCK_FACTORS, MAX_FUNCTIONS, MAX_OBSERVABLES, MAX_SPARSE_TERMS, REGISTERS,
+};
+use crate::dictionary::{
+    Basis, DictionaryError, Factor, basis_functions, block_size, observable_pair, turn,
+};
+use crate::model::{ModelError, Structure};
+use crate::registers::{INPUTS, NOWHERE, ONE, Registers};
+use crate::sparse::{SparseError, SparseTerms};
 use crate::{Number, Scalar};
 
 /// Coefficients of the last factors, which are folded slowest first.
-const REGISTERS: usize = 16;
+const AT_ONCE: usize = 16;
 /// Coefficients are folded on the stack in tiles that have at most this many results after the
 /// first axis.
 const ROOM: usize = 64;
@@ -197,7 +204,7 @@ pub(crate) fn contract<S: Scalar>(
     let (mut size, mut last) = (1_usize, 0_usize);
     for factor in factors.iter().rev() {
         let larger = size.wrapping_mul(factor.radix());
-        if larger > REGISTERS {
+        if larger > AT_ONCE {
             break;
         }
         (size, last) = (larger, last.wrapping_add(1));
@@ -348,34 +355,255 @@ pub(crate) fn chain<S: Number>(entries: &[[u8; 2]], functions: &[S], terms: &mut
     }
 }
 
-/// The outputs of a sparse model: `coefficients` has shape `[outputs, terms]`, `outputs` shape
-/// `[outputs]`.
-#[inline(never)]
-pub(crate) fn contract_chain<S: Scalar>(
-    factors: &[Factor],
-    values: &[S],
-    entries: &[[u8; 2]],
+/// Outputs that are summed at once: with a term and a coefficient of each, as many as leave registers
+/// for everything else.
+const TOGETHER: usize = 4;
+
+/// A Fourier factor of a sparse model: the registers of sine and cosine, and the order, 2 or more.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Harmonics {
+    sin: u8,
+    cos: u8,
+    order: u8,
+}
+
+/// How a step computes what is not in the history. Everything has a register, one after the other:
+///
+/// 1. observables that are centred or scaled; of a dense model all observables in order;
+/// 2. harmonics of a sparse model from the second on, then its powers from the second on, then its
+///    terms without the constant.
+///
+/// Powers and terms are products of two registers.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Program {
+    /// The first register that is computed.
+    first: u8,
+    /// Indices of the observables with a register of their own.
+    scaled: Vec<u8, MAX_OBSERVABLES>,
+    harmonics: Vec<Harmonics, { MAX_FUNCTIONS / 4 }>,
+    products: Vec<[u8; 2], { REGISTERS - INPUTS as usize }>,
+    /// Products that are powers, and not terms.
+    powers: u8,
+}
+
+impl Program {
+    /// Of a structure and the terms that have been checked against its dictionary.
+    pub(crate) fn new(
+        structure: &Structure<'_>,
+        terms: Option<SparseTerms<'_>>,
+    ) -> Result<Self, ModelError> {
+        let (layout, dictionary) = (structure.layout(), structure.dictionary());
+        let mut program = Self {
+            first: layout.end,
+            scaled: Vec::new(),
+            harmonics: Vec::new(),
+            products: Vec::new(),
+            powers: 0,
+        };
+        let mut next = usize::from(layout.end);
+        // Registers beyond the last are noticed at the end.
+        let byte = |register: usize| u8::try_from(register).unwrap_or(NOWHERE);
+        let mut registers: Vec<u8, MAX_OBSERVABLES> = Vec::new();
+        let observables = dictionary.observables().iter().zip(&layout.observables);
+        for (index, (o, register)) in observables.enumerate() {
+            let mut register = *register;
+            if terms.is_none() || (o.centre, o.gain) != (0.0, 1.0) {
+                let _ = program.scaled.push(index as u8);
+                register = byte(next);
+                next = next.saturating_add(1);
+            }
+            let _ = registers.push(register);
+        }
+        let Some(terms) = terms else {
+            return if next <= REGISTERS {
+                Ok(program)
+            } else {
+                let (field, capacity) = ("registers", REGISTERS);
+                let found = next;
+                Err(ModelError::Dictionary(DictionaryError::TooLarge { field, capacity, found }))
+            };
+        };
+        // The register of every function, in order.
+        let mut functions: Vec<u8, MAX_FUNCTIONS> = Vec::new();
+        let factors = dictionary.factors().iter();
+        for factor in factors.clone() {
+            let (v, behind) = observable_pair(*factor, &registers);
+            let _ = functions.push(v);
+            if factor.basis == Basis::Fourier {
+                let _ = functions.push(behind);
+                if factor.order > 1 {
+                    let (sin, cos, order) = (v, behind, factor.order);
+                    let _ = program.harmonics.push(Harmonics { sin, cos, order });
+                }
+            }
+            for _ in 1..factor.order {
+                for _ in 0..if factor.basis == Basis::Fourier { 2 } else { 0 } {
+                    let _ = functions.push(byte(next));
+                    next = next.saturating_add(1);
+                }
+                if factor.basis == Basis::Hermite {
+                    // Its register is not known yet.
+                    let _ = functions.push(NOWHERE);
+                }
+            }
+        }
+        let mut place = functions.iter_mut();
+        for factor in factors {
+            let mut functions = place.by_ref().take(factor.radix().saturating_sub(1));
+            let Some(v) = functions.next().copied() else { continue };
+            let mut power = v;
+            for function in functions {
+                if factor.basis == Basis::Hermite {
+                    let _ = program.products.push([power, v]);
+                    power = byte(next);
+                    *function = power;
+                    next = next.saturating_add(1);
+                }
+            }
+        }
+        program.powers = program.products.len() as u8;
+        let first_term = next;
+        for [parent, function] in terms.entries() {
+            let parent = match parent.checked_sub(1) {
+                None => ONE,
+                Some(earlier) => byte(first_term.saturating_add(earlier.into())),
+            };
+            let function = functions.get(usize::from(*function)).copied().unwrap_or(NOWHERE);
+            let _ = program.products.push([parent, function]);
+            next = next.saturating_add(1);
+        }
+        if next > REGISTERS {
+            let (field, capacity, found) = ("registers", REGISTERS, next);
+            return Err(ModelError::Sparse(SparseError::TooLarge { field, capacity, found }));
+        }
+        Ok(program)
+    }
+
+    /// The outputs of a sparse model: `coefficients` has shape `[outputs, terms]`, `outputs` shape
+    /// `[outputs]`.
+    #[inline(always)]
+    pub(crate) fn sparse<S: Scalar>(
+        &self,
+        structure: &Structure<'_>,
+        registers: &mut Registers<S>,
+        coefficients: &[S],
+        outputs: &mut [S],
+    ) {
+        let mut next = self.scale(structure, registers);
+        for Harmonics { sin, cos, order } in &self.harmonics {
+            let first = (registers.get(*sin), registers.get(*cos));
+            let mut harmonic = first;
+            for _ in 1..*order {
+                harmonic = turn(harmonic, first);
+                registers.set(next, harmonic.0);
+                registers.set(next.wrapping_add(1), harmonic.1);
+                next = next.wrapping_add(2);
+            }
+        }
+        let (powers, terms) =
+            self.products.split_at_checked(self.powers.into()).unwrap_or_default();
+        for [a, b] in powers {
+            registers.set(next, registers.get(*a) * registers.get(*b));
+            next = next.wrapping_add(1);
+        }
+        let (now, later) = outputs.split_at_mut(outputs.len().min(TOGETHER));
+        let count = terms.len().wrapping_add(1);
+        match now.len() {
+            4 => multiply::<S, 4>(registers, next, terms, coefficients, now),
+            3 => multiply::<S, 3>(registers, next, terms, coefficients, now),
+            2 => multiply::<S, 2>(registers, next, terms, coefficients, now),
+            _ => multiply::<S, 1>(registers, next, terms, coefficients, now),
+        }
+        let terms = registers.from(next, terms.len());
+        let mut coefficients = coefficients;
+        for _ in now {
+            coefficients = coefficients.get(count..).unwrap_or(&[]);
+        }
+        let (pairs, last) = later.as_chunks_mut::<2>();
+        for pair in pairs {
+            sum::<S, 2>(terms, coefficients, pair);
+            coefficients = coefficients.get(count.wrapping_mul(2)..).unwrap_or(&[]);
+        }
+        for output in last {
+            sum::<S, 1>(terms, coefficients, core::array::from_mut(output));
+        }
+    }
+
+    /// The values of all observables of a dense model.
+    #[inline(always)]
+    pub(crate) fn dense<'r, S: Scalar>(
+        &self,
+        structure: &Structure<'_>,
+        registers: &'r mut Registers<S>,
+    ) -> &'r [S] {
+        self.scale(structure, registers);
+        registers.from(self.first, self.scaled.len())
+    }
+
+    /// Observables that have a register of their own; returns the one behind them.
+    #[inline(always)]
+    fn scale<S: Scalar>(&self, structure: &Structure<'_>, registers: &mut Registers<S>) -> u8 {
+        let mut next = self.first;
+        let raw = &structure.layout().observables;
+        let observables = structure.dictionary().observables();
+        for index in &self.scaled {
+            let index = usize::from(*index);
+            if let (Some(o), Some(raw)) = (observables.get(index), raw.get(index)) {
+                registers.set(next, o.value(registers.get(*raw)));
+            }
+            next = next.wrapping_add(1);
+        }
+        next
+    }
+}
+
+/// The terms, from register `next` on, and as many outputs as there are sums, from the first on.
+#[inline(always)]
+fn multiply<S: Scalar, const N: usize>(
+    registers: &mut Registers<S>,
+    next: u8,
+    products: &[[u8; 2]],
     coefficients: &[S],
     outputs: &mut [S],
 ) {
-    let mut of_factors = FunctionValues::new();
-    functions(factors, values, &mut of_factors);
-    let mut terms = TermValues::new();
-    chain(entries, &of_factors, &mut terms);
-    // Two outputs at a time load every term once and wait for no addition.
-    let (pairs, last) = outputs.as_chunks_mut::<2>();
+    let Some((mut sums, rows)) = rows_of::<S, N>(products.len(), coefficients) else { return };
+    let mut next = next;
+    for (k, [a, b]) in products.iter().enumerate() {
+        let term = registers.get(*a) * registers.get(*b);
+        registers.set(next, term);
+        next = next.wrapping_add(1);
+        for (sum, row) in sums.iter_mut().zip(rows) {
+            *sum = *sum + row.get(k).copied().unwrap_or_default() * term;
+        }
+    }
+    for (to, sum) in outputs.iter_mut().zip(sums) {
+        *to = sum;
+    }
+}
+
+/// Further outputs from the same terms.
+#[inline(always)]
+fn sum<S: Scalar, const N: usize>(terms: &[S], coefficients: &[S], outputs: &mut [S; N]) {
+    let Some((mut sums, rows)) = rows_of::<S, N>(terms.len(), coefficients) else { return };
+    for (k, term) in terms.iter().enumerate() {
+        for (sum, row) in sums.iter_mut().zip(rows) {
+            *sum = *sum + row.get(k).copied().unwrap_or_default() * *term;
+        }
+    }
+    *outputs = sums;
+}
+
+/// The constants of the first `N` outputs, and their coefficients of `terms` terms.
+#[inline(always)]
+fn rows_of<S: Scalar, const N: usize>(
+    terms: usize,
+    coefficients: &[S],
+) -> Option<([S; N], [&[S]; N])> {
+    let (mut constants, mut rows) = ([S::ZERO; N], [&[][..]; N]);
     let mut rest = coefficients;
-    for [first, second] in pairs {
-        let (a, others) = rest.split_at_checked(terms.len()).unwrap_or((rest, &[]));
-        let (b, others) = others.split_at_checked(terms.len()).unwrap_or((others, &[]));
-        rest = others;
-        let mut rows = terms.iter().zip(a).zip(b);
-        let Some(((_, a), b)) = rows.next() else { return };
-        (*first, *second) = rows.fold((*a, *b), |(x, y), ((t, a), b)| (x + *a * *t, y + *b * *t));
+    for (constant, row) in constants.iter_mut().zip(&mut rows) {
+        let (first, others) = rest.split_first()?;
+        (*constant, (*row, rest)) = (*first, others.split_at_checked(terms)?);
     }
-    for output in last {
-        let mut row = terms.iter().zip(rest);
-        let Some((_, a)) = row.next() else { return };
-        *output = row.fold(*a, |x, (t, a)| x + *a * *t);
-    }
+    Some((constants, rows))
 }

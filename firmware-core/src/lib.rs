@@ -58,6 +58,7 @@ pub mod history;
 mod kernel;
 pub mod model;
 pub mod predictor;
+mod registers;
 mod scalar;
 pub mod sparse;
 
