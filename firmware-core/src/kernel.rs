@@ -23,6 +23,8 @@
 //!    is the function itself.
 //! 3. Every output: c₀, then c₀ + c₁ · t₁, and so on in the order of the terms.
 
+use core::cell::Cell;
+
 use heapless::Vec;
 
 // Sizes of a checked dictionary are small numbers: the wrapping arithmetic below never wraps, and is
@@ -32,10 +34,10 @@ use crate::capacity::{
     MAX_BASIS, MAX_BLOCK_FACTORS, MAX_FUNCTIONS, MAX_OBSERVABLES, MAX_SPARSE_TERMS, REGISTERS,
 };
 use crate::dictionary::{
-    Basis, DictionaryError, Factor, basis_functions, block_size, observable_pair, turn,
+    Basis, DictionaryError, Factor, Observable, basis_functions, block_size, observable_pair, turn,
 };
 use crate::model::{ModelError, Structure};
-use crate::registers::{INPUTS, NOWHERE, ONE, Registers};
+use crate::registers::{Cells, INPUTS, NOWHERE, ONE, Registers};
 use crate::sparse::{SparseError, SparseTerms};
 use crate::{Number, Scalar};
 
@@ -355,16 +357,55 @@ pub(crate) fn chain<S: Number>(entries: &[[u8; 2]], functions: &[S], terms: &mut
     }
 }
 
-/// Outputs that are summed at once: with a term and a coefficient of each, as many as leave registers
-/// for everything else.
-const TOGETHER: usize = 4;
-
 /// A Fourier factor of a sparse model: the registers of sine and cosine, and the order, 2 or more.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Harmonics {
     sin: u8,
     cos: u8,
     order: u8,
+}
+
+/// Outputs that are summed at once while the terms are made; as many as leave the processor registers
+/// for everything else.
+const TOGETHER: usize = 4;
+
+/// Sums terms times coefficients for some outputs at once, so that every term is loaded once: the
+/// name of a term and how it is zipped with its coefficients; for every output the names of it, its
+/// coefficients and its sum.
+macro_rules! sum {
+    ($coefficients:ident, $outputs:ident, $count:expr, $terms:expr, $term:ident, $zipped:pat,
+     $($output:ident $row:ident $sum:ident),+) => {{
+        let mut rest = $coefficients;
+        $(let Some((mut $sum, $row)) = row(&mut rest, $count) else { return };)+
+        for $zipped in $terms$(.zip($row))+ {
+            $($sum = $sum + *$row * $term;)+
+        }
+        if let [$($output),+] = $outputs {
+            $(*$output = $sum;)+
+        }
+    }};
+}
+
+/// A function that makes the terms and the first outputs from them.
+macro_rules! make {
+    ($name:ident, $term:ident, $zipped:pat, $($output:ident $row:ident $sum:ident),+) => {
+        #[inline(never)]
+        fn $name<S: Scalar>(
+            cells: Cells<'_, S>,
+            products: &[[u8; 2]],
+            made: &[Cell<S>],
+            coefficients: &[S],
+            outputs: &mut [S],
+        ) {
+            let terms = products.iter().zip(made).map(|([a, b], to)| {
+                let term = cells.get(*a) * cells.get(*b);
+                to.set(term);
+                term
+            });
+            sum!(coefficients, outputs, products.len(), terms, $term, $zipped,
+                $($output $row $sum),+);
+        }
+    };
 }
 
 /// How a step computes what is not in the history. Everything has a register, one after the other:
@@ -378,8 +419,8 @@ struct Harmonics {
 pub(crate) struct Program {
     /// The first register that is computed.
     first: u8,
-    /// Indices of the observables with a register of their own.
-    scaled: Vec<u8, MAX_OBSERVABLES>,
+    /// Observables with a register of their own: index, and register of the raw value.
+    scaled: Vec<[u8; 2], MAX_OBSERVABLES>,
     harmonics: Vec<Harmonics, { MAX_FUNCTIONS / 4 }>,
     products: Vec<[u8; 2], { REGISTERS - INPUTS as usize }>,
     /// Products that are powers, and not terms.
@@ -408,7 +449,7 @@ impl Program {
         for (index, (o, register)) in observables.enumerate() {
             let mut register = *register;
             if terms.is_none() || (o.centre, o.gain) != (0.0, 1.0) {
-                let _ = program.scaled.push(index as u8);
+                let _ = program.scaled.push([index as u8, register]);
                 register = byte(next);
                 next = next.saturating_add(1);
             }
@@ -479,17 +520,40 @@ impl Program {
         Ok(program)
     }
 
-    /// The outputs of a sparse model: `coefficients` has shape `[outputs, terms]`, `outputs` shape
-    /// `[outputs]`.
+    /// Observables that have a register of their own; returns the register behind them.
     #[inline(always)]
-    pub(crate) fn sparse<S: Scalar>(
+    pub(crate) fn scale<S: Scalar>(
         &self,
-        structure: &Structure<'_>,
+        observables: &[Observable],
+        registers: &mut Registers<S>,
+    ) -> u8 {
+        let mut next = self.first;
+        for [index, raw] in &self.scaled {
+            if let Some(o) = observables.get(usize::from(*index)) {
+                registers.set(next, o.value(registers.get(*raw)));
+            }
+            next = next.wrapping_add(1);
+        }
+        next
+    }
+
+    /// The values of all observables of a dense model, which have been scaled.
+    #[inline]
+    pub(crate) fn values<'r, S: Scalar>(&self, registers: &'r Registers<S>) -> &'r [S] {
+        registers.from(self.first, self.scaled.len())
+    }
+
+    /// The outputs of a sparse model, whose observables have been scaled up to register `next`:
+    /// `coefficients` has shape `[outputs, terms]`, `outputs` shape `[outputs]`.
+    #[inline(always)]
+    pub(crate) fn outputs<S: Scalar>(
+        &self,
+        next: u8,
         registers: &mut Registers<S>,
         coefficients: &[S],
         outputs: &mut [S],
     ) {
-        let mut next = self.scale(structure, registers);
+        let mut next = next;
         for Harmonics { sin, cos, order } in &self.harmonics {
             let first = (registers.get(*sin), registers.get(*cos));
             let mut harmonic = first;
@@ -506,104 +570,53 @@ impl Program {
             registers.set(next, registers.get(*a) * registers.get(*b));
             next = next.wrapping_add(1);
         }
-        let (now, later) = outputs.split_at_mut(outputs.len().min(TOGETHER));
-        let count = terms.len().wrapping_add(1);
-        match now.len() {
-            4 => multiply::<S, 4>(registers, next, terms, coefficients, now),
-            3 => multiply::<S, 3>(registers, next, terms, coefficients, now),
-            2 => multiply::<S, 2>(registers, next, terms, coefficients, now),
-            _ => multiply::<S, 1>(registers, next, terms, coefficients, now),
+        let cells = registers.cells();
+        let made = cells.from(next, terms.len());
+        let (first, others) = outputs.split_at_mut(outputs.len().min(TOGETHER));
+        match first.len() {
+            TOGETHER => make_four(cells, terms, made, coefficients, first),
+            3 => make_three(cells, terms, made, coefficients, first),
+            2 => make_two(cells, terms, made, coefficients, first),
+            _ => make_one(cells, terms, made, coefficients, first),
         }
-        let terms = registers.from(next, terms.len());
-        let mut coefficients = coefficients;
-        for _ in now {
-            coefficients = coefficients.get(count..).unwrap_or(&[]);
-        }
-        let (pairs, last) = later.as_chunks_mut::<2>();
-        for pair in pairs {
-            sum::<S, 2>(terms, coefficients, pair);
-            coefficients = coefficients.get(count.wrapping_mul(2)..).unwrap_or(&[]);
-        }
-        for output in last {
-            sum::<S, 1>(terms, coefficients, core::array::from_mut(output));
-        }
-    }
-
-    /// The values of all observables of a dense model.
-    #[inline(always)]
-    pub(crate) fn dense<'r, S: Scalar>(
-        &self,
-        structure: &Structure<'_>,
-        registers: &'r mut Registers<S>,
-    ) -> &'r [S] {
-        self.scale(structure, registers);
-        registers.from(self.first, self.scaled.len())
-    }
-
-    /// Observables that have a register of their own; returns the one behind them.
-    #[inline(always)]
-    fn scale<S: Scalar>(&self, structure: &Structure<'_>, registers: &mut Registers<S>) -> u8 {
-        let mut next = self.first;
-        let raw = &structure.layout().observables;
-        let observables = structure.dictionary().observables();
-        for index in &self.scaled {
-            let index = usize::from(*index);
-            if let (Some(o), Some(raw)) = (observables.get(index), raw.get(index)) {
-                registers.set(next, o.value(registers.get(*raw)));
+        let row = terms.len().wrapping_add(1);
+        let mut rest = coefficients.get(row.wrapping_mul(TOGETHER)..).unwrap_or(&[]);
+        for pair in others.chunks_mut(2) {
+            if pair.len() == 2 {
+                sum_two(made, rest, pair);
+            } else {
+                sum_one(made, rest, pair);
             }
-            next = next.wrapping_add(1);
+            rest = rest.get(row.wrapping_mul(2)..).unwrap_or(&[]);
         }
-        next
     }
 }
 
-/// The terms, from register `next` on, and as many outputs as there are sums, from the first on.
-#[inline(always)]
-fn multiply<S: Scalar, const N: usize>(
-    registers: &mut Registers<S>,
-    next: u8,
-    products: &[[u8; 2]],
-    coefficients: &[S],
-    outputs: &mut [S],
-) {
-    let Some((mut sums, rows)) = rows_of::<S, N>(products.len(), coefficients) else { return };
-    let mut next = next;
-    for (k, [a, b]) in products.iter().enumerate() {
-        let term = registers.get(*a) * registers.get(*b);
-        registers.set(next, term);
-        next = next.wrapping_add(1);
-        for (sum, row) in sums.iter_mut().zip(rows) {
-            *sum = *sum + row.get(k).copied().unwrap_or_default() * term;
-        }
-    }
-    for (to, sum) in outputs.iter_mut().zip(sums) {
-        *to = sum;
-    }
+// Functions of their own, so that the loop over the terms has the processor's registers for itself.
+make!(make_four, t, ((((t, p), q), r), s), a p w, b q x, c r y, d s z);
+make!(make_three, t, (((t, p), q), r), a p w, b q x, c r y);
+make!(make_two, t, ((t, p), q), a p w, b q x);
+make!(make_one, t, (t, p), a p w);
+
+/// Two further outputs from the terms.
+#[inline(never)]
+fn sum_two<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
+    let values = terms.iter().map(Cell::get);
+    sum!(coefficients, outputs, terms.len(), values, t, ((t, p), q), a p w, b q x);
 }
 
-/// Further outputs from the same terms.
-#[inline(always)]
-fn sum<S: Scalar, const N: usize>(terms: &[S], coefficients: &[S], outputs: &mut [S; N]) {
-    let Some((mut sums, rows)) = rows_of::<S, N>(terms.len(), coefficients) else { return };
-    for (k, term) in terms.iter().enumerate() {
-        for (sum, row) in sums.iter_mut().zip(rows) {
-            *sum = *sum + row.get(k).copied().unwrap_or_default() * *term;
-        }
-    }
-    *outputs = sums;
+/// A further output from the terms.
+#[inline(never)]
+fn sum_one<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
+    let values = terms.iter().map(Cell::get);
+    sum!(coefficients, outputs, terms.len(), values, t, (t, p), a p w);
 }
 
-/// The constants of the first `N` outputs, and their coefficients of `terms` terms.
+/// The constant of the next output and the coefficients of its terms.
 #[inline(always)]
-fn rows_of<S: Scalar, const N: usize>(
-    terms: usize,
-    coefficients: &[S],
-) -> Option<([S; N], [&[S]; N])> {
-    let (mut constants, mut rows) = ([S::ZERO; N], [&[][..]; N]);
-    let mut rest = coefficients;
-    for (constant, row) in constants.iter_mut().zip(&mut rows) {
-        let (first, others) = rest.split_first()?;
-        (*constant, (*row, rest)) = (*first, others.split_at_checked(terms)?);
-    }
-    Some((constants, rows))
+fn row<'a, S: Scalar>(coefficients: &mut &'a [S], terms: usize) -> Option<(S, &'a [S])> {
+    let (constant, rest) = coefficients.split_first()?;
+    let (row, rest) = rest.split_at_checked(terms)?;
+    *coefficients = rest;
+    Some((*constant, row))
 }

@@ -11,7 +11,7 @@ use crate::capacity::{MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVAB
 use crate::dictionary::{Block, Dictionary, DictionaryError, Factor, Observable, Source};
 use crate::error_bounds::ErrorBounds;
 use crate::kernel::Program;
-use crate::registers::Layout;
+use crate::registers::{GROUP, Layout};
 use crate::sparse::{SparseError, SparseTerms};
 
 /// Where a state coordinate lives.
@@ -375,6 +375,20 @@ impl<'a> Structure<'a> {
     #[inline]
     pub(crate) fn layout(&self) -> &Layout {
         &self.layout
+    }
+
+    /// Numbers of the history that a step moves on by one sample: a multiple of four.
+    pub fn delayed(&self) -> usize {
+        usize::from(self.layout.groups).saturating_mul(GROUP)
+    }
+
+    /// Whether a model of this structure, dense or with these terms, gets by with the
+    /// [registers](crate::capacity::REGISTERS) there are.
+    ///
+    /// # Errors
+    /// [`ModelError`] with what it would take.
+    pub fn fits(&self, terms: Option<SparseTerms<'_>>) -> Result<(), ModelError> {
+        Program::new(self, terms).map(|_| ())
     }
 
     /// The metadata again, as a blob holds it.

@@ -197,29 +197,34 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     pub fn step(&self, state: &mut PredictorState<S>, input: &[S]) -> Result<(), PredictError> {
         let (structure, program) = (self.model.structure(), self.model.program());
         let layout = structure.layout();
-        expect_inputs(layout.inputs.len(), input)?;
         let (have, need) = (state.history.ready(layout), structure.lag().saturating_add(1));
         if have < need {
+            expect_inputs(layout.inputs.len(), input)?;
             return Err(PredictError::NotReady { have, need });
+        }
+        expect("inputs", layout.inputs.len(), input.len())?;
+        let registers = state.history.registers_mut();
+        for (index, u) in input.iter().enumerate() {
+            if !u.is_finite() {
+                return Err(PredictError::InputNotFinite { input: index });
+            }
+            registers.set(INPUTS.wrapping_add(index as u8), *u);
         }
         let step = state.step.saturating_add(1);
 
-        let registers = state.history.registers_mut();
-        for (register, u) in (INPUTS..).zip(input) {
-            registers.set(register, *u);
-        }
         let ranges = self.model.ranges().map_or(&[][..], |ranges| ranges.as_chunks().0);
-        let outside = layout.observables.iter().zip(ranges).position(|(register, [low, high])| {
-            let raw = registers.get(*register);
-            !(raw >= *low && raw <= *high)
-        });
+        let outside = layout
+            .observables
+            .iter()
+            .zip(ranges)
+            .position(|(register, [low, high])| registers.get(*register).is_outside(*low, *high));
         let outputs = state.outputs.get_mut(..structure.outputs()).unwrap_or_default();
-        let coefficients = self.model.coefficients();
+        let (dictionary, coefficients) = (structure.dictionary(), self.model.coefficients());
+        let next = program.scale(dictionary.observables(), registers);
         if self.model.terms().is_some() {
-            program.sparse(structure, registers, coefficients, outputs);
+            program.outputs(next, registers, coefficients, outputs);
         } else {
-            let values = program.dense(structure, registers);
-            dense(structure.dictionary(), values, coefficients, outputs);
+            dense(dictionary, program.values(registers), coefficients, outputs);
         }
         let placed = state.history.retract_in_place(layout, outputs, &mut state.next);
         placed.ok_or(PredictError::Diverged { step })?;

@@ -18,6 +18,8 @@
 //! increment the one that led to the present sample (lag 1); of an input the one that acted before
 //! (lag 1).
 
+use core::cell::Cell;
+
 use heapless::Vec;
 
 use crate::Scalar;
@@ -33,7 +35,7 @@ pub(crate) const NOWHERE: u8 = 1;
 pub(crate) const INPUTS: u8 = 2;
 /// Registers of the delay lines that are moved at once: what a Cortex-M loads and stores with one
 /// instruction each.
-const GROUP: usize = 4;
+pub(crate) const GROUP: usize = 4;
 
 /// The registers.
 #[derive(Clone, Debug)]
@@ -72,6 +74,12 @@ impl<S: Scalar> Registers<S> {
         rest.get_mut(..count).unwrap_or_default()
     }
 
+    /// The registers, to be read and written in one loop.
+    #[inline(always)]
+    pub(crate) fn cells(&mut self) -> Cells<'_, S> {
+        Cells(Cell::from_mut(&mut self.0).as_array_of_cells())
+    }
+
     /// Moves the delay lines on by one sample.
     #[inline(always)]
     pub(crate) fn shift(&mut self, layout: &Layout) {
@@ -84,6 +92,23 @@ impl<S: Scalar> Registers<S> {
             *group = [carry, a, b, c];
             carry = d;
         }
+    }
+}
+
+/// All registers, each to be read and written.
+#[derive(Clone, Copy)]
+pub(crate) struct Cells<'r, S>(&'r [Cell<S>; REGISTERS]);
+
+impl<'r, S: Scalar> Cells<'r, S> {
+    #[inline(always)]
+    pub(crate) fn get(self, register: u8) -> S {
+        self.0.get(usize::from(register)).map_or(S::ZERO, Cell::get)
+    }
+
+    /// `count` registers from `first` on, as far as there are.
+    #[inline(always)]
+    pub(crate) fn from(self, first: u8, count: usize) -> &'r [Cell<S>] {
+        self.0.get(usize::from(first)..).and_then(|rest| rest.get(..count)).unwrap_or(&[])
     }
 }
 

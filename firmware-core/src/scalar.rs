@@ -88,6 +88,8 @@ pub trait Scalar:
     fn abs(self) -> Self;
     /// Neither infinite nor NaN.
     fn is_finite(self) -> bool;
+    /// Whether a number, which is not NaN, is below `low` or above `high`.
+    fn is_outside(self, low: Self, high: Self) -> bool;
 
     /// The same angle in (−π, π] \[rad\].
     ///
@@ -155,7 +157,8 @@ impl Scalar for f32 {
     fn from_f32(value: f32) -> Self {
         value
     }
-    #[inline]
+    // Calls of their own: the constants of an inlined one would be loaded where it is not needed.
+    #[inline(never)]
     fn sin_cos(self) -> (Self, Self) {
         let x = self.wrap();
         let shifted = x * core::f32::consts::FRAC_2_PI + ROUND;
@@ -173,7 +176,7 @@ impl Scalar for f32 {
             f32::from_bits(cos.to_bits() ^ sign(quarter.wrapping_add(1))),
         )
     }
-    #[inline]
+    #[inline(never)]
     fn atan2(self, x: Self) -> Self {
         let (width, height) = (x.abs(), self.abs());
         let (short, long) =
@@ -214,6 +217,13 @@ impl Scalar for f32 {
     fn is_finite(self) -> bool {
         self.is_finite()
     }
+    #[inline]
+    fn is_outside(self, low: Self, high: Self) -> bool {
+        // A difference is negative, and not rounded to 0, exactly if the first number is smaller:
+        // one branch where two comparisons have two. Infinite ones may leave NaN of either sign.
+        ((self - low).to_bits() | (high - self).to_bits()) >> 31 != 0
+            && !(self >= low && self <= high)
+    }
 }
 
 impl Scalar for f64 {
@@ -247,5 +257,12 @@ impl Scalar for f64 {
     #[inline]
     fn is_finite(self) -> bool {
         self.is_finite()
+    }
+    #[inline]
+    fn is_outside(self, low: Self, high: Self) -> bool {
+        // A difference is negative, and not rounded to 0, exactly if the first number is smaller:
+        // one branch where two comparisons have two. Infinite ones may leave NaN of either sign.
+        ((self - low).to_bits() | (high - self).to_bits()) >> 63 != 0
+            && !(self >= low && self <= high)
     }
 }

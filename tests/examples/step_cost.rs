@@ -10,6 +10,7 @@ use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
 use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
+use trainer::cost::{self, Cost};
 
 /// Random numbers: xorshift64*.
 struct Random(u64);
@@ -143,7 +144,7 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
         .map(|i| if i % width == 0 { 0.3 } else { 0.1 * random.number() / width as f32 })
         .collect();
     let ranges = [-50.0, 50.0].repeat(observables.len());
-    let ranges = random.chance(90).then_some(&ranges[..]);
+    let ranges = Some(&ranges[..]);
     let model = match dense {
         true => Model::new(structure, &coefficients, ranges),
         false => Model::new_sparse(structure, &terms, &coefficients, ranges),
@@ -158,32 +159,151 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
+/// A worse deviation of a sparse model than this fails.
+const WORST: f64 = 0.02;
+/// Models whose counts the numbers are fitted to; the others only check them.
+const FITTED: f64 = 0.7;
+
+/// A model that has been measured.
+struct Row {
+    name: String,
+    dense: bool,
+    features: Vec<u32>,
+    measured: f64,
+    predicted: f64,
+    bytes: u32,
+}
+
+impl Row {
+    fn deviation(&self) -> f64 {
+        self.predicted / self.measured - 1.0
+    }
+}
+
 fn main() -> ExitCode {
-    let mut arguments = std::env::args().skip(1);
-    let image = arguments.next().unwrap_or_default();
-    let count: usize = arguments.next().and_then(|n| n.parse().ok()).unwrap_or(40);
+    let mut arguments: Vec<String> = std::env::args().skip(1).collect();
+    let fit = arguments.iter().any(|a| a == "--fit");
+    arguments.retain(|a| a != "--fit");
+    let [image, rest @ ..] = &arguments[..] else {
+        eprintln!("usage: step_cost IMAGE [MODELS] [--fit]");
+        return ExitCode::FAILURE;
+    };
+    let count: usize = rest.first().and_then(|n| n.parse().ok()).unwrap_or(40);
     let mut random = Random(1);
     let mut blobs = Vec::new();
     for robot in ["rosbot", "soft-leg", "two-link-arm"] {
         let path = format!("{}/../models/{robot}/model.bin", env!("CARGO_MANIFEST_DIR"));
-        blobs.push(std::fs::read(path).expect("the blob of a model"));
+        blobs.push((robot.to_owned(), std::fs::read(path).expect("the blob of a model")));
     }
     while blobs.len() < 3 + count {
         let dense = blobs.len() % 4 == 3;
-        blobs.extend(model(&mut random, dense));
+        let name = format!("{} {}", if dense { "dense" } else { "sparse" }, blobs.len());
+        blobs.extend(model(&mut random, dense).map(|blob| (name, blob)));
     }
+    let mut rows = measure(image, &blobs);
+    if fit {
+        let constants = fitted(&rows);
+        for (constant, name) in constants.iter().zip(cost::FEATURES) {
+            println!("    {constant:.1}, // {name}");
+        }
+        for row in &mut rows {
+            let products = row.features.iter().zip(&constants).map(|(n, each)| f64::from(*n) * each);
+            row.predicted = products.sum();
+        }
+    }
+    println!("{:<14} {:>8} {:>9} {:>7} {:>7}", "model", "counted", "predicted", "off", "bytes");
+    for row in &rows {
+        let Row { name, measured, predicted, bytes, .. } = row;
+        let off = 100.0 * row.deviation();
+        println!("{name:<14} {measured:>8.0} {predicted:>9.0} {off:>6.2}% {bytes:>7}");
+    }
+    let worst = |dense: bool, rows: &[Row]| {
+        let own = rows.iter().filter(|r| r.dense == dense).map(|r| r.deviation().abs());
+        own.fold(0.0, f64::max)
+    };
+    let (_, checked) = rows.split_at((rows.len() as f64 * FITTED) as usize);
+    println!(
+        "worst of the sparse models {:.2} % (left out of a fit: {:.2} %), of the dense ones {:.1} %",
+        100.0 * worst(false, &rows),
+        100.0 * worst(false, checked),
+        100.0 * worst(true, &rows)
+    );
+    if worst(false, &rows) <= WORST { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+/// Counts the instructions of a step of every blob.
+fn measure(image: &str, blobs: &[(String, Vec<u8>)]) -> Vec<Row> {
     let mut list = tempfile::NamedTempFile::new().expect("a temporary file");
-    for blob in &blobs {
+    for (_, blob) in blobs {
         list.write_all(&(blob.len() as u32).to_le_bytes()).expect("room");
         list.write_all(blob).expect("room");
     }
     let target = format!("enable=on,target=native,arg=list,arg={}", list.path().display());
     let output = Command::new("qemu-system-arm")
         .args(["-M", "netduinoplus2", "-icount", "shift=0", "-nographic"])
-        .args(["-semihosting-config", &target, "-kernel", &image])
+        .args(["-semihosting-config", &target, "-kernel", image])
         .output()
         .expect("qemu-system-arm");
     let text = String::from_utf8_lossy(&output.stdout);
-    print!("{text}");
-    ExitCode::SUCCESS
+    if !output.status.success() {
+        panic!("the image failed:\n{text}{}", String::from_utf8_lossy(&output.stderr));
+    }
+    let mut lines = text.lines();
+    println!("{}", lines.next().unwrap_or_default());
+    let rows = lines.zip(blobs).map(|(line, (name, blob))| {
+        let measured = line.split(' ').nth(2).and_then(|n| n.parse().ok()).expect("a count");
+        let mut words = vec![0_u32; blob.len() / 4];
+        let aligned: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+        aligned.copy_from_slice(blob);
+        let model = firmware_core::parse(aligned).expect("a blob");
+        let (structure, terms) = (model.structure(), model.terms());
+        let cost = Cost::new(structure, terms);
+        assert_eq!(cost.bytes as usize, blob.len(), "{name}: the length is known beforehand");
+        Row {
+            name: name.clone(),
+            dense: terms.is_none(),
+            features: cost::features(structure, terms).to_vec(),
+            measured,
+            predicted: cost.instructions.into(),
+            bytes: cost.bytes,
+        }
+    });
+    rows.collect()
+}
+
+/// Instructions per feature that fit the first models with the least relative squares, sparse and
+/// dense apart where they share nothing.
+fn fitted(rows: &[Row]) -> Vec<f64> {
+    let n = cost::FEATURES.len();
+    let (rows, _) = rows.split_at((rows.len() as f64 * FITTED) as usize);
+    // The table of dense models is coarse: they do not shape the numbers that sparse ones share.
+    let weight = |row: &Row| if row.dense { 1e-3 } else { 1.0 } / row.measured;
+    let mut sums = vec![vec![0.0; n + 1]; n];
+    for row in rows {
+        let w = weight(row);
+        for i in 0..n {
+            let a = f64::from(row.features[i]) * w;
+            for j in 0..n {
+                sums[i][j] += a * f64::from(row.features[j]) * w;
+            }
+            sums[i][n] += a * row.measured * w;
+        }
+    }
+    for (i, row) in sums.iter_mut().enumerate() {
+        // Features that do not occur are 0.
+        row[i] += 1e-16;
+    }
+    for i in 0..n {
+        let pivot = (i..n).max_by(|a, b| sums[*a][i].abs().total_cmp(&sums[*b][i].abs()));
+        sums.swap(i, pivot.unwrap_or(i));
+        for j in 0..n {
+            if j != i {
+                let factor = sums[j][i] / sums[i][i];
+                for k in i..=n {
+                    sums[j][k] -= factor * sums[i][k];
+                }
+            }
+        }
+    }
+    (0..n).map(|i| sums[i][n] / sums[i][i]).collect()
 }
