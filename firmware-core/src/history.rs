@@ -2,9 +2,9 @@
 //! outputs back to coordinates.
 
 use crate::Scalar;
-use crate::capacity::{MAX_OUTPUTS, MAX_STATES};
+use crate::capacity::MAX_STATES;
 use crate::model::{Space, Structure, Symmetry, Target};
-use crate::registers::{INPUTS, Kind, Layout, NOWHERE, Registers};
+use crate::registers::{GROUP, INPUTS, Kind, Layout, Registers};
 
 /// One sample of the robot.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,6 +77,11 @@ impl<S: Scalar> History<S> {
         if self.layout == layout.id { self.filled.into() } else { 0 }
     }
 
+    #[inline]
+    pub(crate) fn registers(&self) -> &Registers<S> {
+        &self.registers
+    }
+
     /// Where a step puts its inputs and what it computes: everything that is not kept.
     #[inline]
     pub(crate) fn registers_mut(&mut self) -> &mut Registers<S> {
@@ -95,70 +100,26 @@ impl<S: Scalar> History<S> {
             true => self.increment(structure, next),
             false => [S::ZERO; MAX_STATES],
         };
-        for (i, to) in self.registers.from_mut(INPUTS, layout.inputs.len()).iter_mut().enumerate() {
+        for (i, to) in self.registers.from_mut(INPUTS, layout.inputs()).iter_mut().enumerate() {
             *to = at(input, i as u8);
         }
-        self.move_on(layout);
-        let parts = next.x.iter().zip(&next.sin).zip(&next.cos).zip(increment);
-        for (place, (((x, sin), cos), increment)) in layout.states.iter().zip(parts) {
-            self.registers.set(place.x, *x);
-            self.registers.set(place.sin, *sin);
-            self.registers.set(place.cos, *cos);
-            self.registers.set(place.increment, increment);
+        let mut staged = [[S::ZERO; GROUP]; MAX_STATES];
+        let parts = next.x.iter().zip(increment).zip(&next.sin).zip(&next.cos);
+        for (to, (((x, increment), sin), cos)) in staged.iter_mut().zip(parts) {
+            *to = [*x, increment, *sin, *cos];
         }
+        self.registers.advance(layout, &staged);
         // Only what a later step may look at is counted.
         let room = u8::try_from(structure.lag()).unwrap_or(u8::MAX).saturating_add(1);
         self.filled = self.filled.saturating_add(1).min(room);
     }
 
-    /// Moves the delay lines on by one sample and puts the inputs of the step in front of theirs.
-    #[inline(always)]
-    fn move_on(&mut self, layout: &Layout) {
-        self.registers.shift(layout);
-        for (head, from) in layout.inputs.iter().zip(INPUTS..) {
-            self.registers.set(*head, self.registers.get(from));
-        }
-    }
-
-    /// Takes a predicted sample as [`retract_in_place`](Self::retract_in_place) made it.
-    #[inline(always)]
-    pub(crate) fn advance(&mut self, layout: &Layout, outputs: &[S], next: &[S; MAX_STATES]) {
-        self.move_on(layout);
-        let registers = &mut self.registers;
-        let mut outputs = outputs.iter().copied();
-        for (place, x) in layout.states.iter().zip(next) {
-            let z = outputs.next().unwrap_or_default();
-            match place.kind {
-                Kind::Angle | Kind::LimitedAngle => {
-                    registers.set(place.sin, z);
-                    registers.set(place.cos, outputs.next().unwrap_or_default());
-                    registers.set(place.increment, *x);
-                }
-                Kind::Line | Kind::Increment | Kind::Pose | Kind::AngleIncrement => {
-                    registers.set(place.x, *x);
-                    registers.set(place.increment, z);
-                }
-                Kind::AngleIncrementTrigonometric => {
-                    registers.set(place.x, *x);
-                    registers.set(place.increment, z);
-                    let (sin, cos) = x.sin_cos();
-                    registers.set(place.sin, sin);
-                    registers.set(place.cos, cos);
-                }
-            }
-        }
-    }
-
     /// Coordinate `i` of the present sample.
     #[inline]
     fn coordinate(&self, layout: &Layout, i: u8) -> S {
-        let place = layout.place(i);
-        match place.kind {
-            Kind::Angle | Kind::LimitedAngle => {
-                self.registers.get(place.sin).atan2(self.registers.get(place.cos))
-            }
-            _ => self.registers.get(place.x),
-        }
+        let present = self.registers.present(layout).get(usize::from(i));
+        let [x, _, sin, cos] = present.copied().unwrap_or_default();
+        if layout.kind(i).absolute_angle() { sin.atan2(cos) } else { x }
     }
 
     /// The present coordinates in `out`, shape `[states]`: angles in (−π, π] where the model
@@ -179,9 +140,8 @@ impl<S: Scalar> History<S> {
         input: &'h [S],
     ) -> impl Iterator<Item = S> + 'h {
         let layout = structure.layout();
-        let (behind, _) = layout.kept();
         layout.observables.iter().map(move |register| match register.checked_sub(INPUTS) {
-            Some(index) if *register < behind => at(input, index),
+            Some(index) if *register < layout.present => at(input, index),
             _ => self.registers.get(*register),
         })
     }
@@ -229,84 +189,74 @@ impl<S: Scalar> History<S> {
     /// not finite, an absolute angle has lost its direction, or a coordinate leaves its limit.
     #[inline]
     pub fn retract(&self, structure: &Structure<'_>, outputs: &[S]) -> Option<Sample<S>> {
-        let mut placed = [S::ZERO; MAX_OUTPUTS];
-        for (to, z) in placed.iter_mut().zip(outputs) {
-            *to = *z;
-        }
+        let mut staged = [[S::ZERO; GROUP]; MAX_STATES];
+        self.stage(structure.layout(), outputs, &mut staged)?;
         let mut next = Sample::ZERO;
-        let Sample { x, sin, cos } = &mut next;
-        let layout = structure.layout();
-        self.retract_in_place(layout, placed.get_mut(..outputs.len())?, x)?;
-        let mut placed = placed.iter().copied();
-        for (place, ((x, sin), cos)) in layout.states.iter().zip(x.iter().zip(sin).zip(cos)) {
-            let z = placed.next()?;
-            match place.kind {
-                Kind::Angle | Kind::LimitedAngle => (*sin, *cos) = (z, placed.next()?),
-                Kind::AngleIncrementTrigonometric => (*sin, *cos) = x.sin_cos(),
-                _ => {}
-            }
+        let parts = next.x.iter_mut().zip(&mut next.sin).zip(&mut next.cos);
+        for (((x, sin), cos), staged) in parts.zip(staged) {
+            [*x, _, *sin, *cos] = staged;
         }
         Some(next)
     }
 
-    /// From the operator's outputs in place to what a history takes: the next coordinate in `next`
-    /// and its change in the output, or sine and cosine, back on the circle, in the outputs and the
-    /// change, if it is observed, in `next`. Nothing that is kept changes. `None` as in
-    /// [`retract`](Self::retract).
+    /// The next sample from the operator's outputs as the registers hold it, four numbers per
+    /// coordinate, in `next`. Nothing that is kept changes. `None` as in [`retract`](Self::retract).
     #[inline(always)]
-    pub(crate) fn retract_in_place(
+    pub(crate) fn stage(
         &self,
         layout: &Layout,
-        outputs: &mut [S],
-        next: &mut [S; MAX_STATES],
+        outputs: &[S],
+        next: &mut [[S; GROUP]; MAX_STATES],
     ) -> Option<()> {
         let registers = &self.registers;
         if let Some(pose) = layout.pose {
             let (s, c) = (registers.get(pose.sin), registers.get(pose.cos));
             let (ahead, left) = (at(outputs, pose.ahead), at(outputs, pose.left));
-            *next.get_mut(usize::from(pose.x))? = c * ahead - s * left;
-            *next.get_mut(usize::from(pose.y))? = s * ahead + c * left;
+            let [x, ..] = next.get_mut(usize::from(pose.x))?;
+            *x = c * ahead - s * left;
+            let [y, ..] = next.get_mut(usize::from(pose.y))?;
+            *y = s * ahead + c * left;
         }
-        let mut outputs = outputs.iter_mut();
-        for (place, next) in layout.states.iter().zip(next) {
+        let mut outputs = outputs.iter().copied();
+        let present = registers.present(layout);
+        for ((place, next), present) in layout.states.iter().zip(next).zip(present) {
             let z = outputs.next()?;
-            let mut angle_change = None;
+            let ([from, ..], [to, change, sin, cos]) = (present, next);
             let x = match place.kind {
                 Kind::Line => {
-                    let x = *z;
-                    *z = x - registers.get(place.x);
-                    x
+                    *change = z - *from;
+                    z
                 }
-                Kind::Increment => *z + registers.get(place.x),
-                Kind::Pose => *next + registers.get(place.x),
+                Kind::Increment => {
+                    *change = z;
+                    z + *from
+                }
+                Kind::Pose => {
+                    *change = z;
+                    *to + *from
+                }
                 Kind::AngleIncrement | Kind::AngleIncrementTrigonometric => {
                     // Hundreds of turns within a step would only look fine once they are wrapped.
                     if z.abs() > S::from_f32(LONG) {
                         return None;
                     }
-                    (*z + registers.get(place.x)).wrap()
+                    *change = z;
+                    let x = (z + *from).wrap();
+                    if place.kind == Kind::AngleIncrementTrigonometric {
+                        (*sin, *cos) = x.sin_cos_within();
+                    }
+                    x
                 }
-                Kind::Angle | Kind::LimitedAngle => {
-                    let c = outputs.next()?;
-                    let square = *z * *z + *c * *c;
-                    // Far from the circle the direction means nothing; also catches NaN.
-                    if !(square > S::from_f32(1.0 / (LONG * LONG))
-                        && square < S::from_f32(LONG * LONG))
-                    {
-                        return None;
-                    }
-                    let shrink = square.reciprocal_root();
-                    (*z, *c) = (*z * shrink, *c * shrink);
-                    let observed = place.increment != NOWHERE;
-                    let angle = match place.kind == Kind::LimitedAngle || observed {
-                        true => z.atan2(*c),
-                        false => S::ZERO,
-                    };
-                    if observed {
-                        let from = registers.get(place.sin).atan2(registers.get(place.cos));
-                        angle_change = Some((angle - from).wrap());
-                    }
-                    angle
+                Kind::Circle => {
+                    [*sin, *cos] = on_circle([z, outputs.next()?])?;
+                    continue;
+                }
+                Kind::Angle => {
+                    [*sin, *cos] = on_circle([z, outputs.next()?])?;
+                    let [_, _, from_sin, from_cos] = present;
+                    let x = sin.atan2(*cos);
+                    *change = (x - from_sin.atan2(*from_cos)).wrap();
+                    x
                 }
             };
             let [low, high] = place.limit.map(S::from_f32);
@@ -314,9 +264,15 @@ impl<S: Scalar> History<S> {
             if !(x >= low && x <= high) {
                 return None;
             }
-            *next = angle_change.unwrap_or(x);
+            *to = x;
         }
         Some(())
+    }
+
+    /// Takes the sample that [`stage`](Self::stage) made.
+    #[inline(always)]
+    pub(crate) fn advance(&mut self, layout: &Layout, next: &[[S; GROUP]; MAX_STATES]) {
+        self.registers.advance(layout, next);
     }
 
     /// The increments of all coordinates from the present sample to another: wrapped on S¹, the pose
@@ -326,19 +282,19 @@ impl<S: Scalar> History<S> {
         let mut increment = [S::ZERO; MAX_STATES];
         let layout = structure.layout();
         for (i, (d, place)) in (0..).zip(increment.iter_mut().zip(&layout.states)) {
-            let to = match place.kind {
+            let to = match place.kind.absolute_angle() {
                 // Two arc tangents for nothing if no one reads the change of an absolute angle.
-                Kind::Angle | Kind::LimitedAngle if !layout.increments => continue,
-                Kind::Angle | Kind::LimitedAngle => at(&to.sin, i).atan2(at(&to.cos, i)),
-                _ => at(&to.x, i),
+                true if !layout.increments => continue,
+                true => at(&to.sin, i).atan2(at(&to.cos, i)),
+                false => at(&to.x, i),
             };
             let change = to - self.coordinate(layout, i);
             let circle = structure.states().get(usize::from(i)).map(|s| s.space);
             *d = if circle == Some(Space::Circle) { change.wrap() } else { change };
         }
         if let Symmetry::Se2 { x, y, heading } = structure.symmetry() {
-            let heading = layout.place(heading);
-            let (s, c) = (self.registers.get(heading.sin), self.registers.get(heading.cos));
+            let present = self.registers.present(layout).get(usize::from(heading));
+            let [_, _, s, c] = present.copied().unwrap_or_default();
             let (dx, dy) = (at(&increment, x), at(&increment, y));
             if let Some(ahead) = increment.get_mut(usize::from(x)) {
                 *ahead = c * dx + s * dy;
@@ -354,6 +310,18 @@ impl<S: Scalar> History<S> {
 /// How far from the circle (sin, cos) may be, as a factor, and how far an angle may turn within a
 /// step \[rad\], before a prediction counts as diverged.
 const LONG: f32 = 1e3;
+
+/// Sine and cosine, back on the circle; `None` if they have lost their direction.
+#[inline(never)]
+fn on_circle<S: Scalar>([s, c]: [S; 2]) -> Option<[S; 2]> {
+    let square = s * s + c * c;
+    // Far from the circle the direction means nothing; also catches NaN.
+    if !(square > S::from_f32(1.0 / (LONG * LONG)) && square < S::from_f32(LONG * LONG)) {
+        return None;
+    }
+    let shrink = square.reciprocal_root();
+    Some([s * shrink, c * shrink])
+}
 
 impl Structure<'_> {
     /// A sample from coordinates, shape `[states]`, angles in radians; missing ones are 0.

@@ -375,12 +375,13 @@ const TOGETHER: usize = 4;
 macro_rules! sum {
     ($coefficients:ident, $outputs:ident, $count:expr, $terms:expr, $term:ident, $zipped:pat,
      $($output:ident $row:ident $sum:ident),+) => {{
-        let mut rest = $coefficients;
-        $(let Some((mut $sum, $row)) = row(&mut rest, $count) else { return };)+
+        let mut rows = $coefficients.chunks_exact($count.wrapping_add(1).max(1));
+        $(let Some([$sum, $row @ ..]) = rows.next() else { return };
+        let mut $sum = *$sum;)+
         for $zipped in $terms$(.zip($row))+ {
             $($sum = $sum + *$row * $term;)+
         }
-        if let [$($output),+] = $outputs {
+        if let [$($output,)+ ..] = $outputs {
             $(*$output = $sum;)+
         }
     }};
@@ -572,23 +573,31 @@ impl Program {
         }
         let cells = registers.cells();
         let made = cells.from(next, terms.len());
-        let (first, others) = outputs.split_at_mut(outputs.len().min(TOGETHER));
-        match first.len() {
-            TOGETHER => make_four(cells, terms, made, coefficients, first),
-            3 => make_three(cells, terms, made, coefficients, first),
-            2 => make_two(cells, terms, made, coefficients, first),
-            _ => make_one(cells, terms, made, coefficients, first),
+        match outputs.len() {
+            0 => {}
+            1 => make_one(cells, terms, made, coefficients, outputs),
+            2 => make_two(cells, terms, made, coefficients, outputs),
+            3 => make_three(cells, terms, made, coefficients, outputs),
+            _ => make_four(cells, terms, made, coefficients, outputs),
         }
-        let row = terms.len().wrapping_add(1);
-        let mut rest = coefficients.get(row.wrapping_mul(TOGETHER)..).unwrap_or(&[]);
-        for pair in others.chunks_mut(2) {
-            if pair.len() == 2 {
-                sum_two(made, rest, pair);
-            } else {
-                sum_one(made, rest, pair);
-            }
-            rest = rest.get(row.wrapping_mul(2)..).unwrap_or(&[]);
+        if outputs.len() > TOGETHER {
+            sum_others(made, coefficients, outputs);
         }
+    }
+}
+
+/// The outputs beyond the first ones from the terms, two by two.
+#[inline(never)]
+fn sum_others<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
+    let row = terms.len().wrapping_add(1);
+    let mut rest = coefficients.get(row.wrapping_mul(TOGETHER)..).unwrap_or(&[]);
+    let (pairs, last) = outputs.get_mut(TOGETHER..).unwrap_or_default().as_chunks_mut::<2>();
+    for pair in pairs {
+        sum_two(terms, rest, pair);
+        rest = rest.get(row.wrapping_mul(2)..).unwrap_or(&[]);
+    }
+    if !last.is_empty() {
+        sum_one(terms, rest, last);
     }
 }
 
@@ -610,13 +619,4 @@ fn sum_two<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) 
 fn sum_one<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
     let values = terms.iter().map(Cell::get);
     sum!(coefficients, outputs, terms.len(), values, t, (t, p), a p w);
-}
-
-/// The constant of the next output and the coefficients of its terms.
-#[inline(always)]
-fn row<'a, S: Scalar>(coefficients: &mut &'a [S], terms: usize) -> Option<(S, &'a [S])> {
-    let (constant, rest) = coefficients.split_first()?;
-    let (row, rest) = rest.split_at_checked(terms)?;
-    *coefficients = rest;
-    Some((*constant, row))
 }

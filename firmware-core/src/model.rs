@@ -260,13 +260,10 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
             }
             lag = lag.max(o.lag);
         }
-        let layout = Layout::new(
-            &states,
-            inputs.len(),
-            symmetry,
-            dictionary.observables(),
-            |coordinate| trigonometric & bit(coordinate) != 0,
-        );
+        let layout =
+            Layout::new(&states, inputs.len(), symmetry, dictionary.observables(), |coordinate| {
+                trigonometric & bit(coordinate) != 0
+            });
         Ok(Self {
             robot,
             sample_time_s,
@@ -382,6 +379,11 @@ impl<'a> Structure<'a> {
         usize::from(self.layout.groups).saturating_mul(GROUP)
     }
 
+    /// Coordinates, sines, cosines, changes and inputs of which earlier samples are kept.
+    pub fn delay_lines(&self) -> usize {
+        self.layout.heads.len()
+    }
+
     /// Whether a model of this structure, dense or with these terms, gets by with the
     /// [registers](crate::capacity::REGISTERS) there are.
     ///
@@ -422,7 +424,7 @@ pub struct Model<'a, S = f32> {
     /// How the registers are computed.
     program: Program,
     coefficients: &'a [S],
-    ranges: Option<&'a [S]>,
+    ranges: Option<&'a [[S; 2]]>,
     error_bounds: Option<ErrorBounds<'a>>,
 }
 
@@ -507,7 +509,9 @@ impl<'a, S: Scalar> Model<'a, S> {
         ranges: Option<&'a [S]>,
     ) -> Result<Self, ModelError> {
         let program = Program::new(&structure, terms)?;
-        let model = Self { structure, terms, program, coefficients, ranges, error_bounds: None };
+        let pairs = ranges.map(|ranges| ranges.as_chunks().0);
+        let model =
+            Self { structure, terms, program, coefficients, ranges: pairs, error_bounds: None };
         let structure = &model.structure;
         let expected = structure.outputs().saturating_mul(model.coefficients_per_output());
         let mismatch =
@@ -580,7 +584,13 @@ impl<'a, S: Scalar> Model<'a, S> {
     /// Smallest and largest raw value of every observable in the training data.
     #[inline]
     pub fn ranges(&self) -> Option<&'a [S]> {
-        self.ranges
+        self.ranges.map(|pairs| pairs.as_flattened())
+    }
+
+    /// The same, `[smallest, largest]` of every observable; none if they are not known.
+    #[inline]
+    pub(crate) fn range_pairs(&self) -> &'a [[S; 2]] {
+        self.ranges.unwrap_or(&[])
     }
 
     /// How far off the predictions may be, if that was measured.

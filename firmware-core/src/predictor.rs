@@ -6,7 +6,7 @@ use crate::dictionary::Dictionary;
 use crate::history::History;
 use crate::kernel::{Scratch, contract};
 use crate::model::Model;
-use crate::registers::INPUTS;
+use crate::registers::{GROUP, INPUTS, Layout, Registers};
 
 /// The first time a rollout left the range that the model was trained in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,9 +60,9 @@ pub struct PredictorState<S = f32> {
     history: History<S>,
     step: u32,
     out_of_range: Option<OutOfRange>,
-    /// What the last step made on the way: the operator's outputs, and the next coordinates.
+    /// What the last step made on the way: the operator's outputs, and the next sample.
     outputs: [S; MAX_OUTPUTS],
-    next: [S; MAX_STATES],
+    next: [[S; GROUP]; MAX_STATES],
 }
 
 /// What a step has made on the way is not compared.
@@ -80,7 +80,7 @@ impl<S: Scalar> Default for PredictorState<S> {
             step: 0,
             out_of_range: None,
             outputs: [S::ZERO; MAX_OUTPUTS],
-            next: [S::ZERO; MAX_STATES],
+            next: [[S::ZERO; GROUP]; MAX_STATES],
         }
     }
 }
@@ -199,25 +199,24 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         let layout = structure.layout();
         let (have, need) = (state.history.ready(layout), structure.lag().saturating_add(1));
         if have < need {
-            expect_inputs(layout.inputs.len(), input)?;
+            expect_inputs(layout.inputs(), input)?;
             return Err(PredictError::NotReady { have, need });
         }
-        expect("inputs", layout.inputs.len(), input.len())?;
+        expect("inputs", layout.inputs(), input.len())?;
         let registers = state.history.registers_mut();
-        for (index, u) in input.iter().enumerate() {
+        for (register, u) in registers.from_mut(INPUTS, input.len()).iter_mut().zip(input) {
             if !u.is_finite() {
-                return Err(PredictError::InputNotFinite { input: index });
+                return expect_inputs(input.len(), input);
             }
-            registers.set(INPUTS.wrapping_add(index as u8), *u);
+            *register = *u;
         }
         let step = state.step.saturating_add(1);
 
-        let ranges = self.model.ranges().map_or(&[][..], |ranges| ranges.as_chunks().0);
-        let outside = layout
-            .observables
-            .iter()
-            .zip(ranges)
-            .position(|(register, [low, high])| registers.get(*register).is_outside(*low, *high));
+        let ranges = self.model.range_pairs();
+        let mut outside = 0;
+        for (register, [low, high]) in layout.observables.iter().zip(ranges) {
+            outside |= registers.get(*register).outside(*low, *high);
+        }
         let outputs = state.outputs.get_mut(..structure.outputs()).unwrap_or_default();
         let (dictionary, coefficients) = (structure.dictionary(), self.model.coefficients());
         let next = program.scale(dictionary.observables(), registers);
@@ -226,14 +225,14 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         } else {
             dense(dictionary, program.values(registers), coefficients, outputs);
         }
-        let placed = state.history.retract_in_place(layout, outputs, &mut state.next);
-        placed.ok_or(PredictError::Diverged { step })?;
+        let staged = state.history.stage(layout, outputs, &mut state.next);
+        staged.ok_or(PredictError::Diverged { step })?;
 
-        if let Some(observable) = outside {
-            let earlier = state.out_of_range;
-            state.out_of_range = earlier.or(Some(OutOfRange { step, observable }));
+        if outside >> 31 != 0 && state.out_of_range.is_none() {
+            let observable = first_outside(layout, state.history.registers(), ranges);
+            state.out_of_range = observable.map(|observable| OutOfRange { step, observable });
         }
-        state.history.advance(layout, outputs, &state.next);
+        state.history.advance(layout, &state.next);
         state.step = step;
         Ok(())
     }
@@ -306,14 +305,23 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     }
 }
 
+/// The first observable outside its range.
+#[cold]
+#[inline(never)]
+fn first_outside<S: Scalar>(
+    layout: &Layout,
+    registers: &Registers<S>,
+    ranges: &[[S; 2]],
+) -> Option<usize> {
+    layout.observables.iter().zip(ranges).position(|(register, [low, high])| {
+        let raw = registers.get(*register);
+        !(raw >= *low && raw <= *high)
+    })
+}
+
 /// The outputs of a dense model.
 #[inline(never)]
-fn dense<S: Scalar>(
-    dictionary: &Dictionary,
-    values: &[S],
-    coefficients: &[S],
-    outputs: &mut [S],
-) {
+fn dense<S: Scalar>(dictionary: &Dictionary, values: &[S], coefficients: &[S], outputs: &mut [S]) {
     outputs.fill(S::ZERO);
     let (stride, mut scratch) = (dictionary.dense_terms(), Scratch::new());
     let mut coefficients = coefficients;
@@ -323,7 +331,7 @@ fn dense<S: Scalar>(
     }
 }
 
-#[inline]
+#[inline(never)]
 fn expect_inputs<S: Scalar>(expected: usize, input: &[S]) -> Result<(), PredictError> {
     expect("inputs", expected, input.len())?;
     match input.iter().position(|u| !u.is_finite()) {

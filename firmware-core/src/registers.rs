@@ -5,18 +5,15 @@
 //! | registers | what they hold |
 //! |---|---|
 //! | 0 | the constant 1 |
-//! | 1 | what is written and never read |
+//! | 1 | nothing |
 //! | 2 … | the inputs of the step to be predicted, in order |
-//! | then | what the history keeps of the present sample only |
-//! | then | *delay lines*: a coordinate, sine, cosine, increment or input at consecutive samples, the newest first; padded to a multiple of [`GROUP`] |
+//! | then | the present sample, four per coordinate: itself, its change since the sample before, sine, cosine |
+//! | then | *delay lines*: what is observed of earlier samples, each source at consecutive samples, the newest first; padded to a multiple of four |
 //! | then | what a step computes: standardised observables, functions and terms ([`kernel`](crate::kernel)) |
 //!
 //! All delay lines move on by one sample when all their registers are moved up by one: the last of a
-//! line falls onto the head of the next line, which is then written anew.
-//!
-//! The head of the line of a coordinate, its sine and its cosine is the present sample; of an
-//! increment the one that led to the present sample (lag 1); of an input the one that acted before
-//! (lag 1).
+//! line falls onto the head of the next line, which is then written anew, from the present sample or
+//! the inputs.
 
 use core::cell::Cell;
 
@@ -29,13 +26,17 @@ use crate::model::{Space, State, Symmetry, Target};
 
 /// Register of the constant 1.
 pub(crate) const ONE: u8 = 0;
-/// Register that is written and never read.
+/// Register that nothing uses.
 pub(crate) const NOWHERE: u8 = 1;
 /// Register of the first input.
 pub(crate) const INPUTS: u8 = 2;
-/// Registers of the delay lines that are moved at once: what a Cortex-M loads and stores with one
-/// instruction each.
+/// Registers of a coordinate in the present sample, and registers of the delay lines that are moved at
+/// once: what a Cortex-M loads and stores with one instruction each.
 pub(crate) const GROUP: usize = 4;
+/// Where they are among the four of a coordinate.
+pub(crate) const CHANGE: u8 = 1;
+pub(crate) const SIN: u8 = 2;
+pub(crate) const COS: u8 = 3;
 
 /// The registers.
 #[derive(Clone, Debug)]
@@ -80,9 +81,15 @@ impl<S: Scalar> Registers<S> {
         Cells(Cell::from_mut(&mut self.0).as_array_of_cells())
     }
 
-    /// Moves the delay lines on by one sample.
+    /// The present sample.
     #[inline(always)]
-    pub(crate) fn shift(&mut self, layout: &Layout) {
+    pub(crate) fn present(&self, layout: &Layout) -> &[[S; GROUP]] {
+        self.0.get(usize::from(layout.present)..).unwrap_or_default().as_chunks().0
+    }
+
+    /// Moves on by one sample: delay lines, and then the present sample.
+    #[inline(always)]
+    pub(crate) fn advance(&mut self, layout: &Layout, next: &[[S; GROUP]; MAX_STATES]) {
         let lines = self.0.get_mut(usize::from(layout.lines)..).unwrap_or_default();
         let (groups, _) = lines.as_chunks_mut::<GROUP>();
         // The head of the first line is written anew, whatever comes in.
@@ -91,6 +98,14 @@ impl<S: Scalar> Registers<S> {
             let [a, b, c, d] = *group;
             *group = [carry, a, b, c];
             carry = d;
+        }
+        for [head, from] in &layout.heads {
+            self.set(*head, self.get(*from));
+        }
+        let present = self.0.get_mut(usize::from(layout.present)..).unwrap_or_default();
+        let (present, _) = present.as_chunks_mut::<GROUP>();
+        for ((to, from), _) in present.iter_mut().zip(next).zip(&layout.states) {
+            *to = *from;
         }
     }
 }
@@ -113,7 +128,7 @@ impl<'r, S: Scalar> Cells<'r, S> {
 }
 
 /// What the operator's outputs for a coordinate become.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// On ℝ, the next value.
     #[default]
@@ -122,27 +137,28 @@ pub(crate) enum Kind {
     Increment,
     /// On ℝ, its change, rotated with the pose.
     Pose,
-    /// On S¹, sine and cosine, whose limits no angle leaves.
-    Angle,
-    /// The same with limits.
-    LimitedAngle,
     /// On S¹, its change.
     AngleIncrement,
     /// The same, with sine and cosine needed.
     AngleIncrementTrigonometric,
+    /// On S¹, sine and cosine, from which nothing else is needed.
+    Circle,
+    /// The same, with limits or an observed change, which take the angle.
+    Angle,
 }
 
-/// Where a coordinate is kept, and its limits.
+impl Kind {
+    /// Whether the outputs are sine and cosine.
+    #[inline]
+    pub(crate) fn absolute_angle(self) -> bool {
+        matches!(self, Self::Circle | Self::Angle)
+    }
+}
+
+/// What becomes of a coordinate's outputs, and its limits.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Place {
     pub(crate) kind: Kind,
-    /// The coordinate; [`NOWHERE`] for an absolute angle.
-    pub(crate) x: u8,
-    /// Sine and cosine; [`NOWHERE`] where they are not needed.
-    pub(crate) sin: u8,
-    pub(crate) cos: u8,
-    /// The increment that led to the present sample; [`NOWHERE`] if it is not observed.
-    pub(crate) increment: u8,
     /// Limits of the coordinate, finite: what is within them is finite.
     pub(crate) limit: [f32; 2],
 }
@@ -161,6 +177,9 @@ pub(crate) struct Pose {
     pub(crate) cos: u8,
 }
 
+/// Sources that may have a delay line.
+const LINES: usize = 4 * MAX_STATES + MAX_INPUTS;
+
 /// Where everything lies that a history keeps.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Layout {
@@ -168,10 +187,13 @@ pub(crate) struct Layout {
     pub(crate) observables: Vec<u8, MAX_OBSERVABLES>,
     pub(crate) states: Vec<Place, MAX_STATES>,
     pub(crate) pose: Option<Pose>,
-    /// Head of the line of every input; [`NOWHERE`] if no earlier one is observed.
-    pub(crate) inputs: Vec<u8, MAX_INPUTS>,
-    /// Increments are observed.
+    /// The first register of every delay line, and where its next value comes from.
+    pub(crate) heads: Vec<[u8; 2], LINES>,
+    /// Changes of coordinates are observed.
     pub(crate) increments: bool,
+    inputs: u8,
+    /// The first register of the present sample.
+    pub(crate) present: u8,
     /// The first register of the delay lines, and how many groups they are.
     pub(crate) lines: u8,
     pub(crate) groups: u8,
@@ -181,10 +203,10 @@ pub(crate) struct Layout {
     pub(crate) id: u32,
 }
 
-/// Registers that a history needs at most.
+/// Registers that a history needs at most: of an angle its sine, cosine and changes are delayed.
 const HISTORY: usize = INPUTS as usize
     + MAX_INPUTS
-    + MAX_STATES * (1 + 2 * (MAX_LAG + 1) + MAX_LAG)
+    + MAX_STATES * (GROUP + 2 * MAX_LAG + MAX_LAG - 1)
     + MAX_INPUTS * MAX_LAG
     + GROUP;
 const _: () = assert!(HISTORY < REGISTERS, "no index of a register that keeps something overflows");
@@ -199,129 +221,117 @@ impl Layout {
         observables: &[Observable],
         trigonometric: impl Fn(usize) -> bool,
     ) -> Self {
-        // Registers of a source: as far back as it is observed.
-        let length = |source: Source, present: bool| {
-            let lags = observables.iter().filter(|o| o.source == source).map(|o| o.lag);
-            match (lags.max(), source) {
-                (Some(lag), Source::Increment(_) | Source::Input(_)) => lag,
-                (Some(lag), _) => lag.saturating_add(1),
-                (None, _) => u8::from(present),
-            }
-        };
-        let mut layout = Self {
-            observables: Vec::new(),
-            states: states.iter().take(MAX_STATES).map(place).collect(),
-            pose: None,
-            inputs: (0..inputs.min(MAX_INPUTS)).map(|_| NOWHERE).collect(),
-            increments: false,
-            lines: 0,
-            groups: 0,
-            end: 0,
-            id: 0,
-        };
-        let mut next = INPUTS.saturating_add(layout.inputs.len() as u8);
-        for lines in [false, true] {
-            if lines {
-                layout.lines = next;
-            }
-            let mut put = |to: &mut u8, source, present| {
-                let length = length(source, present);
-                if length > 0 && (length > 1) == lines {
-                    *to = next;
-                    next = next.saturating_add(length);
+        let observed = |source| observables.iter().any(|o| o.source == source);
+        let places = (0..).zip(states.iter().take(MAX_STATES)).map(|(i, state)| {
+            let [low, high] = state.limit;
+            let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
+            let kind = match (state.target, state.space) {
+                (Target::Absolute, Space::Line) => Kind::Line,
+                (Target::Increment, Space::Line) => match symmetry {
+                    Symmetry::Se2 { x, y, .. } if x == i || y == i => Kind::Pose,
+                    _ => Kind::Increment,
+                },
+                (Target::Absolute, Space::Circle) => {
+                    match limited || observed(Source::Increment(i)) {
+                        true => Kind::Angle,
+                        false => Kind::Circle,
+                    }
                 }
+                (Target::Increment, Space::Circle) => match trigonometric(i.into()) {
+                    true => Kind::AngleIncrementTrigonometric,
+                    false => Kind::AngleIncrement,
+                },
             };
-            for (i, place) in (0..).zip(&mut layout.states) {
-                let angle = matches!(place.kind, Kind::Angle | Kind::LimitedAngle);
-                let turns = trigonometric(i.into());
-                put(&mut place.x, Source::State(i), !angle);
-                put(&mut place.sin, Source::Sin(i), turns);
-                put(&mut place.cos, Source::Cos(i), turns);
-                put(&mut place.increment, Source::Increment(i), false);
-                if turns && place.kind == Kind::AngleIncrement {
-                    place.kind = Kind::AngleIncrementTrigonometric;
-                }
-            }
-            for (i, head) in (0..).zip(&mut layout.inputs) {
-                put(head, Source::Input(i), false);
-            }
-        }
-        layout.groups = next.saturating_sub(layout.lines).div_ceil(GROUP as u8);
-        layout.end = layout.lines.saturating_add(layout.groups.saturating_mul(GROUP as u8));
+            Place { kind, limit: [low.max(f32::MIN), high.min(f32::MAX)] }
+        });
+        let places: Vec<Place, MAX_STATES> = places.collect();
+        let present = INPUTS.saturating_add(inputs as u8);
+        let coordinate = |i: u8| present.saturating_add(i.saturating_mul(GROUP as u8));
 
-        if let Symmetry::Se2 { x, y, heading } = symmetry {
-            // An absolute angle has two outputs.
-            let output = |coordinate: u8| {
-                layout.states.iter().take(coordinate.into()).fold(0_u8, |sum, s| {
-                    let angle = matches!(s.kind, Kind::Angle | Kind::LimitedAngle);
-                    sum.saturating_add(1).saturating_add(angle.into())
-                })
-            };
-            let (ahead, left) = (output(x), output(y));
-            let heading = layout.place(heading);
-            layout.pose =
-                Some(Pose { x, y, ahead, left, sin: heading.sin, cos: heading.cos });
-            for coordinate in [x, y] {
-                if let Some(place) = layout.states.get_mut(usize::from(coordinate)) {
-                    place.kind = Kind::Pose;
+        // The register of a source at its latest sample, and the lag of that sample.
+        let latest = |source: Source| match source {
+            Source::State(i) => (coordinate(i), 0),
+            Source::Sin(i) => (coordinate(i).saturating_add(SIN), 0),
+            Source::Cos(i) => (coordinate(i).saturating_add(COS), 0),
+            Source::Increment(i) => (coordinate(i).saturating_add(CHANGE), 1),
+            Source::Input(i) => (INPUTS.saturating_add(i), 0),
+        };
+        let lines = coordinate(places.len() as u8);
+        let mut next = lines;
+        // The first register of the line of every source.
+        let mut heads: Vec<[u8; 2], LINES> = Vec::new();
+        let mut registers: Vec<u8, MAX_OBSERVABLES> = Vec::new();
+        for o in observables {
+            let (from, lag) = latest(o.source);
+            if o.lag <= lag {
+                let _ = registers.push(from);
+                continue;
+            }
+            let head = match heads.iter().find(|[_, source]| *source == from) {
+                Some([head, _]) => *head,
+                None => {
+                    let own = observables.iter().filter(|other| other.source == o.source);
+                    let oldest = own.map(|o| o.lag).max().unwrap_or(lag);
+                    let _ = heads.push([next, from]);
+                    let head = next;
+                    next = next.saturating_add(oldest.saturating_sub(lag));
+                    head
                 }
-            }
+            };
+            let _ =
+                registers.push(head.saturating_add(o.lag.saturating_sub(lag)).saturating_sub(1));
         }
-        layout.increments = layout.states.iter().any(|s| s.increment != NOWHERE);
-        let registers = observables.iter().map(|o| match o.source {
-            Source::State(i) => layout.place(i).x.saturating_add(o.lag),
-            Source::Sin(i) => layout.place(i).sin.saturating_add(o.lag),
-            Source::Cos(i) => layout.place(i).cos.saturating_add(o.lag),
-            Source::Increment(i) => {
-                layout.place(i).increment.saturating_add(o.lag).saturating_sub(1)
+        let groups = next.saturating_sub(lines).div_ceil(GROUP as u8);
+        let pose = match symmetry {
+            Symmetry::Se2 { x, y, heading } => {
+                // An absolute angle has two outputs.
+                let output = |coordinate: u8| {
+                    places.iter().take(coordinate.into()).fold(0_u8, |sum, place| {
+                        sum.saturating_add(1).saturating_add(place.kind.absolute_angle().into())
+                    })
+                };
+                let ((sin, _), (cos, _)) =
+                    (latest(Source::Sin(heading)), latest(Source::Cos(heading)));
+                Some(Pose { x, y, ahead: output(x), left: output(y), sin, cos })
             }
-            Source::Input(i) if o.lag == 0 => INPUTS.saturating_add(i),
-            Source::Input(i) => {
-                let head = layout.inputs.get(usize::from(i)).copied().unwrap_or(NOWHERE);
-                head.saturating_add(o.lag).saturating_sub(1)
-            }
-        });
-        layout.observables = registers.collect();
-        let places = layout.states.iter().flat_map(|s| [s.x, s.sin, s.cos, s.increment]);
-        let bytes = places.chain(layout.inputs.iter().copied()).chain([layout.lines, layout.groups]);
+            _ => None,
+        };
+        let bytes = heads.iter().flatten().copied().chain([present, lines, groups]);
+        let trigonometric = (0..places.len()).map(|i| trigonometric(i).into());
         // FNV-1a.
-        layout.id = bytes.fold(0x811C_9DC5, |id: u32, byte| {
-            (id ^ u32::from(byte)).wrapping_mul(0x0100_0193)
-        });
-        layout
+        let id = bytes
+            .chain(trigonometric)
+            .fold(0x811C_9DC5, |id: u32, byte| (id ^ u32::from(byte)).wrapping_mul(0x0100_0193));
+        Self {
+            observables: registers,
+            states: places,
+            pose,
+            heads,
+            increments: (0..states.len() as u8).any(|i| observed(Source::Increment(i))),
+            inputs: inputs as u8,
+            present,
+            lines,
+            groups,
+            end: lines.saturating_add(groups.saturating_mul(GROUP as u8)),
+            id,
+        }
     }
 
-    /// The place of a coordinate that a checked structure has.
+    /// Inputs of the model.
     #[inline]
-    pub(crate) fn place(&self, coordinate: u8) -> Place {
-        self.states.get(usize::from(coordinate)).copied().unwrap_or_default()
+    pub(crate) fn inputs(&self) -> usize {
+        self.inputs.into()
+    }
+
+    /// What becomes of a coordinate that a checked structure has.
+    #[inline]
+    pub(crate) fn kind(&self, coordinate: u8) -> Kind {
+        self.states.get(usize::from(coordinate)).map(|place| place.kind).unwrap_or_default()
     }
 
     /// The registers that a history keeps: the first, and how many.
     #[inline]
     pub(crate) fn kept(&self) -> (u8, u8) {
-        let first = INPUTS.saturating_add(self.inputs.len() as u8);
-        (first, self.end.saturating_sub(first))
-    }
-}
-
-/// A coordinate that is kept nowhere yet.
-fn place(state: &State<'_>) -> Place {
-    let [low, high] = state.limit;
-    let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
-    let kind = match (state.target, state.space) {
-        (Target::Absolute, Space::Line) => Kind::Line,
-        (Target::Increment, Space::Line) => Kind::Increment,
-        (Target::Absolute, Space::Circle) if limited => Kind::LimitedAngle,
-        (Target::Absolute, Space::Circle) => Kind::Angle,
-        (Target::Increment, Space::Circle) => Kind::AngleIncrement,
-    };
-    Place {
-        kind,
-        x: NOWHERE,
-        sin: NOWHERE,
-        cos: NOWHERE,
-        increment: NOWHERE,
-        limit: [low.max(f32::MIN), high.min(f32::MAX)],
+        (self.present, self.end.saturating_sub(self.present))
     }
 }

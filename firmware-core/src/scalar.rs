@@ -75,8 +75,14 @@ pub trait Scalar:
 
     /// The same number; `f32` to `f64` is exact.
     fn from_f32(value: f32) -> Self;
-    /// `(sin, cos)` of an angle in radians.
-    fn sin_cos(self) -> (Self, Self);
+    /// `(sin, cos)` of an angle in radians. In `f32` our own polynomials, off by at most 1.0e-7 for
+    /// angles in (−π, π]; larger ones are [wrapped](Self::wrap) first, which turns them by up to
+    /// 2.8e-8 of their size, less than what rounding them to `f32` has turned them by.
+    fn sin_cos(self) -> (Self, Self) {
+        self.wrap().sin_cos_within()
+    }
+    /// [`sin_cos`](Self::sin_cos) of an angle that is wrapped.
+    fn sin_cos_within(self) -> (Self, Self);
     /// The angle of the point `(x, self)`, in (−π, π].
     fn atan2(self, x: Self) -> Self;
     /// One over the square root of a positive number; in `f32` with a relative error of at most
@@ -88,8 +94,10 @@ pub trait Scalar:
     fn abs(self) -> Self;
     /// Neither infinite nor NaN.
     fn is_finite(self) -> bool;
-    /// Whether a number, which is not NaN, is below `low` or above `high`.
-    fn is_outside(self, low: Self, high: Self) -> bool;
+    /// The first bit is set if a number, which is not NaN, is below `low` or above `high`: a
+    /// difference is negative, and not rounded to 0, exactly if the first number is smaller. It may
+    /// also be set where infinite numbers are equal.
+    fn outside(self, low: Self, high: Self) -> u32;
 
     /// The same angle in (−π, π] \[rad\].
     ///
@@ -101,20 +109,23 @@ pub trait Scalar:
     /// ```
     #[inline]
     fn wrap(self) -> Self {
-        if self > -Self::PI && self <= Self::PI {
-            self
-        } else {
-            // The remainder and one turn more or less are exact, so that no rounding at the seam
-            // and no large angle leaves the interval.
-            let turn = self.rem(Self::TAU);
-            if turn > Self::PI {
-                turn - Self::TAU
-            } else if turn <= -Self::PI {
-                turn + Self::TAU
-            } else {
-                turn
-            }
-        }
+        if self > -Self::PI && self <= Self::PI { self } else { wrap(self) }
+    }
+}
+
+/// [`Scalar::wrap`] of an angle that is not there yet.
+#[cold]
+#[inline(never)]
+fn wrap<S: Scalar>(angle: S) -> S {
+    // The remainder and one turn more or less are exact, so that no rounding at the seam and no
+    // large angle leaves the interval.
+    let turn = angle.rem(S::TAU);
+    if turn > S::PI {
+        turn - S::TAU
+    } else if turn <= -S::PI {
+        turn + S::TAU
+    } else {
+        turn
     }
 }
 
@@ -142,13 +153,6 @@ const ATAN: [f32; 4] = [8.053_744_5e-2, -1.387_768_6e-1, 1.997_771_1e-1, -3.333_
 /// tan π/8
 const TAN_PI_8: f32 = 0.414_213_56;
 
-#[inline(always)]
-fn horner<const N: usize>(coefficients: [f32; N], x: f32) -> f32 {
-    let mut coefficients = coefficients.into_iter();
-    let first = coefficients.next().unwrap_or_default();
-    coefficients.fold(first, |sum, c| sum * x + c)
-}
-
 impl Scalar for f32 {
     const PI: Self = core::f32::consts::PI;
     const TAU: Self = core::f32::consts::TAU;
@@ -159,15 +163,16 @@ impl Scalar for f32 {
     }
     // Calls of their own: the constants of an inlined one would be loaded where it is not needed.
     #[inline(never)]
-    fn sin_cos(self) -> (Self, Self) {
-        let x = self.wrap();
+    fn sin_cos_within(self) -> (Self, Self) {
+        let x = self;
         let shifted = x * core::f32::consts::FRAC_2_PI + ROUND;
         let (turns, quarter) = (shifted - ROUND, shifted.to_bits());
         let [high, low] = HALF_PI;
         let r = (x - turns * high) - turns * low;
         let square = r * r;
-        let sin = horner(SIN, square) * (square * r) + r;
-        let cos = horner(COS, square) * (square * square) + (1.0 - 0.5 * square);
+        let ([a, b, c], [d, e, f]) = (SIN, COS);
+        let sin = ((a * square + b) * square + c) * (square * r) + r;
+        let cos = ((d * square + e) * square + f) * (square * square) + (1.0 - 0.5 * square);
         let (sin, cos) = if quarter & 1 == 0 { (sin, cos) } else { (cos, sin) };
         // The sine of the third and fourth quarter is negative, the cosine of the second and third.
         let sign = |quarter: u32| (quarter & 2) << 30;
@@ -179,8 +184,7 @@ impl Scalar for f32 {
     #[inline(never)]
     fn atan2(self, x: Self) -> Self {
         let (width, height) = (x.abs(), self.abs());
-        let (short, long) =
-            if height > width { (width, height) } else { (height, width) };
+        let (short, long) = if height > width { (width, height) } else { (height, width) };
         // arctan q = π/4 + arctan((q − 1) / (q + 1))
         let (above, below, octant) = if short > TAN_PI_8 * long {
             (short - long, short + long, core::f32::consts::FRAC_PI_4)
@@ -189,9 +193,10 @@ impl Scalar for f32 {
         };
         let q = if below > 0.0 { above / below } else { 0.0 };
         let square = q * q;
-        let angle = octant + (horner(ATAN, square) * (square * q) + q);
-        let angle =
-            if height > width { core::f32::consts::FRAC_PI_2 - angle } else { angle };
+        let [a, b, c, d] = ATAN;
+        let series = ((a * square + b) * square + c) * square + d;
+        let angle = octant + (series * (square * q) + q);
+        let angle = if height > width { core::f32::consts::FRAC_PI_2 - angle } else { angle };
         let angle = if x < 0.0 { core::f32::consts::PI - angle } else { angle };
         if self < 0.0 { -angle } else { angle }
     }
@@ -199,11 +204,10 @@ impl Scalar for f32 {
     fn reciprocal_root(self) -> Self {
         // A guess to 3.5 % from the exponent; every round of Newton's method squares the error.
         let half = 0.5 * self;
-        let mut root = f32::from_bits(0x5F37_59DF_u32.wrapping_sub(self.to_bits() >> 1));
-        for _ in 0..3 {
-            root = root * (1.5 - half * root * root);
-        }
-        root
+        let root = f32::from_bits(0x5F37_59DF_u32.wrapping_sub(self.to_bits() >> 1));
+        let root = root * (1.5 - half * root * root);
+        let root = root * (1.5 - half * root * root);
+        root * (1.5 - half * root * root)
     }
     #[inline]
     fn rem(self, divisor: Self) -> Self {
@@ -218,11 +222,8 @@ impl Scalar for f32 {
         self.is_finite()
     }
     #[inline]
-    fn is_outside(self, low: Self, high: Self) -> bool {
-        // A difference is negative, and not rounded to 0, exactly if the first number is smaller:
-        // one branch where two comparisons have two. Infinite ones may leave NaN of either sign.
-        ((self - low).to_bits() | (high - self).to_bits()) >> 31 != 0
-            && !(self >= low && self <= high)
+    fn outside(self, low: Self, high: Self) -> u32 {
+        (self - low).to_bits() | (high - self).to_bits()
     }
 }
 
@@ -236,6 +237,10 @@ impl Scalar for f64 {
     }
     #[inline]
     fn sin_cos(self) -> (Self, Self) {
+        libm::sincos(self)
+    }
+    #[inline]
+    fn sin_cos_within(self) -> (Self, Self) {
         libm::sincos(self)
     }
     #[inline]
@@ -259,10 +264,7 @@ impl Scalar for f64 {
         self.is_finite()
     }
     #[inline]
-    fn is_outside(self, low: Self, high: Self) -> bool {
-        // A difference is negative, and not rounded to 0, exactly if the first number is smaller:
-        // one branch where two comparisons have two. Infinite ones may leave NaN of either sign.
-        ((self - low).to_bits() | (high - self).to_bits()) >> 63 != 0
-            && !(self >= low && self <= high)
+    fn outside(self, low: Self, high: Self) -> u32 {
+        (((self - low).to_bits() | (high - self).to_bits()) >> 32) as u32
     }
 }

@@ -10,7 +10,7 @@ use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
 use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
-use trainer::cost::{self, Cost};
+use trainer::cost::{self, Cost, Part};
 
 /// Random numbers: xorshift64*.
 struct Random(u64);
@@ -57,10 +57,10 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
     if se2 {
         symmetry = Symmetry::Se2 { x: 0, y: 1, heading: 2 };
     } else if random.chance(30) {
-        let coordinates = (0..n as u8).filter(|i| {
-            states[usize::from(*i)].target == Target::Increment && random.chance(60)
-        });
-        symmetry = Symmetry::Translation { coordinates: coordinates.fold(0, |set, i| set | 1 << i) };
+        let coordinates = (0..n as u8)
+            .filter(|i| states[usize::from(*i)].target == Target::Increment && random.chance(60));
+        symmetry =
+            Symmetry::Translation { coordinates: coordinates.fold(0, |set, i| set | 1 << i) };
     }
     let largest = random.below(6) as u8;
     let mut sources = Vec::new();
@@ -98,7 +98,8 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
         let observable = observables.len() as u8;
         let fourier = group.len() == 2 && random.chance(70);
         let basis = if fourier { Basis::Fourier } else { Basis::Hermite };
-        let order = if random.chance(70) { 1 } else { 2 + random.below(if dense { 1 } else { 3 }) as u8 };
+        let order =
+            if random.chance(70) { 1 } else { 2 + random.below(if dense { 1 } else { 3 }) as u8 };
         factors.push(Factor { observable, basis, order });
         for (source, lag) in group.iter().take(1 + usize::from(fourier)) {
             let scaled = standardised
@@ -168,7 +169,7 @@ const FITTED: f64 = 0.7;
 struct Row {
     name: String,
     dense: bool,
-    features: Vec<u32>,
+    parts: Vec<Part>,
     measured: f64,
     predicted: f64,
     bytes: u32,
@@ -203,11 +204,11 @@ fn main() -> ExitCode {
     let mut rows = measure(image, &blobs);
     if fit {
         let constants = fitted(&rows);
-        for (constant, name) in constants.iter().zip(cost::FEATURES) {
-            println!("    {constant:.1}, // {name}");
+        for (constant, part) in constants.iter().zip(&rows[0].parts) {
+            println!("{constant:.1} // {}", part.name);
         }
         for row in &mut rows {
-            let products = row.features.iter().zip(&constants).map(|(n, each)| f64::from(*n) * each);
+            let products = row.parts.iter().zip(&constants).map(|(p, each)| p.count as f64 * each);
             row.predicted = products.sum();
         }
     }
@@ -262,7 +263,7 @@ fn measure(image: &str, blobs: &[(String, Vec<u8>)]) -> Vec<Row> {
         Row {
             name: name.clone(),
             dense: terms.is_none(),
-            features: cost::features(structure, terms).to_vec(),
+            parts: cost::parts(structure, terms).to_vec(),
             measured,
             predicted: cost.instructions.into(),
             bytes: cost.bytes,
@@ -274,7 +275,7 @@ fn measure(image: &str, blobs: &[(String, Vec<u8>)]) -> Vec<Row> {
 /// Instructions per feature that fit the first models with the least relative squares, sparse and
 /// dense apart where they share nothing.
 fn fitted(rows: &[Row]) -> Vec<f64> {
-    let n = cost::FEATURES.len();
+    let n = rows[0].parts.len();
     let (rows, _) = rows.split_at((rows.len() as f64 * FITTED) as usize);
     // The table of dense models is coarse: they do not shape the numbers that sparse ones share.
     let weight = |row: &Row| if row.dense { 1e-3 } else { 1.0 } / row.measured;
@@ -282,9 +283,9 @@ fn fitted(rows: &[Row]) -> Vec<f64> {
     for row in rows {
         let w = weight(row);
         for i in 0..n {
-            let a = f64::from(row.features[i]) * w;
+            let a = row.parts[i].count as f64 * w;
             for j in 0..n {
-                sums[i][j] += a * f64::from(row.features[j]) * w;
+                sums[i][j] += a * row.parts[j].count as f64 * w;
             }
             sums[i][n] += a * row.measured * w;
         }

@@ -1,56 +1,15 @@
 //! What a model costs on the controller: instructions of one step, bytes of its blob.
 //!
-//! The instructions are a sum over what a step does, [`FEATURES`], each with a number of
-//! instructions, [`CORTEX_M4F`], which was fitted to counts on an emulated Cortex-M4F.
-//! `firmware-sim/cortex-m/measure` counts again and compares; `measure --fit` prints new numbers.
-//! They hold for the worst path of a step that succeeds: no observable is out of range (the first
-//! that is ends the check), and no angle needs the remainder of more than a turn.
+//! The instructions are a sum over the [`parts`] of a step, each with a number of instructions that
+//! was fitted to counts on an emulated Cortex-M4F. `firmware-sim/cortex-m/measure` counts again and
+//! compares; `measure --fit` prints new numbers. They hold for the worst path of a step that
+//! succeeds and stays in range: the first step that leaves it also looks for the observable, and an
+//! angle that turns beyond half a turn takes a remainder.
 
 use firmware_core::SparseTerms;
 use firmware_core::blob;
-use firmware_core::dictionary::{Basis, Source};
-use firmware_core::model::{Space, Structure, Symmetry, Target};
-
-/// What a step does, how often. Up to four outputs are summed while the terms are made, further ones
-/// two by two.
-pub const FEATURES: [&str; 33] = [
-    "step of a model with 1 output",
-    "step of a model with 2 outputs",
-    "step of a model with 3 outputs",
-    "step of a model with 4 outputs or more",
-    "input",
-    "four numbers of the history moved on",
-    "observable and its range",
-    "observable that is centred or scaled",
-    "Fourier factor of order 2 or more",
-    "sine and cosine of a harmonic from the second on",
-    "power from the second on",
-    "term and its product with 1 output",
-    "term and its products with 2 outputs",
-    "term and its products with 3 outputs",
-    "term and its products with 4 outputs",
-    "two further outputs",
-    "term times two further outputs",
-    "last further output",
-    "term times the last further output",
-    "coordinate on R, next value",
-    "coordinate on R, change",
-    "angle, next sine and cosine",
-    "limits of an angle predicted by sine and cosine",
-    "change of an angle predicted by sine and cosine, observed",
-    "angle, change",
-    "sine and cosine of an angle predicted by its change",
-    "planar pose",
-    "step of a dense model",
-    "dense block",
-    "factor of a dense block",
-    "dense block and output",
-    "dense coefficient, first 16 of a block",
-    "dense coefficient",
-];
-
-/// Instructions of the [`FEATURES`] on a Cortex-M4F with FPU.
-pub const CORTEX_M4F: [f32; FEATURES.len()] = [0.0; FEATURES.len()];
+use firmware_core::dictionary::{Basis, Factor, Source};
+use firmware_core::model::{Space, State, Structure, Symmetry, Target};
 
 /// What one model takes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
@@ -68,83 +27,123 @@ impl Cost {
     /// Of a model with trained ranges: dense, or with these terms.
     pub fn new(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> Self {
         let bytes = blob::size(structure, terms, true);
-        let instructions = instructions(structure, terms);
-        Self { instructions, bytes: u32::try_from(bytes).unwrap_or(u32::MAX) }
+        Self {
+            instructions: instructions(structure, terms),
+            bytes: u32::try_from(bytes).unwrap_or(u32::MAX),
+        }
     }
 }
 
 /// Executed instructions of one step on a Cortex-M4F.
 pub fn instructions(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> u32 {
-    let counts = features(structure, terms);
-    counts.iter().zip(CORTEX_M4F).map(|(count, each)| *count as f32 * each).sum::<f32>().round()
-        as u32
+    let parts = parts(structure, terms);
+    parts.iter().map(|part| part.count as f32 * part.each).sum::<f32>().round() as u32
 }
 
-/// How often a step does each of the [`FEATURES`].
-pub fn features(
-    structure: &Structure<'_>,
-    terms: Option<SparseTerms<'_>>,
-) -> [u32; FEATURES.len()] {
-    let mut counts = [0_usize; FEATURES.len()];
-    let dictionary = structure.dictionary();
-    let outputs = structure.outputs();
-    counts[4] = structure.inputs().len();
-    counts[5] = structure.delayed() / 4;
-    counts[6] = dictionary.observables().len();
-    match terms {
-        Some(terms) => {
-            let scaled = dictionary.observables().iter();
-            counts[7] = scaled.filter(|o| (o.centre, o.gain) != (0.0, 1.0)).count();
-            for factor in dictionary.blocks().flat_map(|(_, factors)| factors) {
-                let beyond = usize::from(factor.order) - 1;
-                match factor.basis {
-                    Basis::Hermite => counts[10] += beyond,
-                    Basis::Fourier => {
-                        counts[8] += usize::from(beyond > 0);
-                        counts[9] += beyond;
-                    }
-                }
-            }
-            let (together, count) = (outputs.clamp(1, 4) - 1, terms.count() - 1);
-            counts[together] = 1;
-            counts[11 + together] = count;
-            let later = outputs.saturating_sub(4);
-            (counts[15], counts[16]) = (later / 2, later / 2 * count);
-            (counts[17], counts[18]) = (later % 2, later % 2 * count);
-        }
-        None => {
-            counts[7] = dictionary.observables().len();
-            counts[27] = 1;
-            for (_, factors) in dictionary.blocks() {
-                let size: usize = factors.iter().map(|f| f.radix()).product();
-                counts[28] += 1;
-                counts[29] += factors.len();
-                counts[30] += outputs;
-                counts[31] += outputs * size.min(16);
-                counts[32] += outputs * size;
-            }
-        }
-    }
-    let observed = |source: Source| dictionary.observables().iter().any(|o| o.source == source);
-    for (i, state) in (0_u8..).zip(structure.states()) {
-        let heading = matches!(structure.symmetry(), Symmetry::Se2 { heading, .. } if heading == i);
-        let turns = heading || observed(Source::Sin(i)) || observed(Source::Cos(i));
-        match (state.space, state.target) {
-            (Space::Line, Target::Absolute) => counts[19] += 1,
-            (Space::Line, Target::Increment) => counts[20] += 1,
-            (Space::Circle, Target::Absolute) => {
-                let [low, high] = state.limit;
-                let limited = low > -std::f32::consts::PI || high < std::f32::consts::PI;
-                counts[21] += 1;
-                counts[22] += usize::from(limited);
-                counts[23] += usize::from(observed(Source::Increment(i)));
-            }
-            (Space::Circle, Target::Increment) => {
-                counts[24] += 1;
-                counts[25] += usize::from(turns);
-            }
-        }
-    }
-    counts[26] = usize::from(matches!(structure.symmetry(), Symmetry::Se2 { .. }));
-    counts.map(|count| u32::try_from(count).unwrap_or(u32::MAX))
+/// Something that a step does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Part {
+    /// What.
+    pub name: &'static str,
+    /// How often a model does it.
+    pub count: usize,
+    /// Instructions each time.
+    pub each: f32,
+}
+
+/// What a step does. Of a sparse model up to four outputs are summed while the terms are made, further
+/// ones two by two.
+pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part; 31] {
+    let part = |name, count, each| Part { name, count, each };
+    let (dense, outputs) = (terms.is_none(), structure.outputs());
+    let observables = structure.dictionary().observables();
+    let scaled = observables.iter().filter(|o| dense || (o.centre, o.gain) != (0.0, 1.0)).count();
+
+    // A sparse model has a factor per block, and no blocks for the kernel.
+    let factors = structure.dictionary().blocks().flat_map(|(_, factors)| factors);
+    let factors: Vec<&Factor> = factors.filter(|_| !dense).collect();
+    let beyond = |f: &&Factor| usize::from(f.order) - 1;
+    let of_basis = |basis| factors.iter().copied().filter(move |f| f.basis == basis);
+    let fourier = of_basis(Basis::Fourier).filter(|f| f.order > 1);
+    let powers = of_basis(Basis::Hermite).map(|f| beyond(&f)).sum();
+    let fourier_harmonics = fourier.clone().map(|f| beyond(&f)).sum();
+    let count = terms.map_or(0, |terms| terms.entries().len());
+    let made = [1, 2, 3, 4].map(|n| if outputs.min(4) == n { count } else { 0 });
+    let later = if dense { 0 } else { outputs.saturating_sub(4) };
+
+    let blocks = structure.dictionary().blocks().filter(|_| dense);
+    let blocks: Vec<(usize, usize)> =
+        blocks.map(|(_, own)| (own.len(), own.iter().map(|f| f.radix()).product())).collect();
+
+    let of =
+        |kind: &dyn Fn(&State<'_>) -> bool| structure.states().iter().filter(|s| kind(s)).count();
+    let absolute = |s: &State<'_>| (s.space, s.target) == (Space::Circle, Target::Absolute);
+    let observed = |source: Source| observables.iter().any(|o| o.source == source);
+    let heading =
+        |i: u8| matches!(structure.symmetry(), Symmetry::Se2 { heading, .. } if heading == i);
+    let states = (0_u8..).zip(structure.states());
+    let turned = states.clone().filter(|(i, s)| {
+        let needed = heading(*i) || observed(Source::Sin(*i)) || observed(Source::Cos(*i));
+        (s.space, s.target) == (Space::Circle, Target::Increment) && needed
+    });
+    let turned = turned.count();
+    let angles = states.filter(|(i, s)| {
+        let [low, high] = s.limit;
+        let limited = low > -std::f32::consts::PI || high < std::f32::consts::PI;
+        absolute(s) && (limited || observed(Source::Increment(*i)))
+    });
+    let angles = angles.count();
+    [
+        part("step", 1, 178.3),
+        part("step of a dense model", usize::from(dense), -99.5),
+        part("input", structure.inputs().len(), 11.4),
+        part("observable and its range", observables.len(), 13.7),
+        part("observable that is centred or scaled", scaled, 19.9),
+        part("source with a delay line", structure.delay_lines(), 6.7),
+        part("four numbers of the history moved on", structure.delayed() / 4, 12.9),
+        part("Fourier factor from order 2 on", fourier.count(), 14.5),
+        part("sine and cosine of a harmonic from the second on", fourier_harmonics, 17.9),
+        part("power from the second on", powers, 13.1),
+        part("term and its product with 1 output", made[0], 12.0),
+        part("term and its products with 2 outputs", made[1], 16.1),
+        part("term and its products with 3 outputs", made[2], 19.0),
+        part("term and its products with 4 outputs", made[3], 22.2),
+        part("more than 4 outputs", later.min(1), 39.1),
+        part("two further outputs", later / 2, 19.8),
+        part("term times two further outputs", later / 2 * count, 11.0),
+        part("last further output", later % 2, 14.5),
+        part("term times the last further output", later % 2 * count, 4.9),
+        part(
+            "coordinate on R, next value",
+            of(&|s| (s.space, s.target) == (Space::Line, Target::Absolute)),
+            43.3,
+        ),
+        part(
+            "coordinate on R, change",
+            of(&|s| (s.space, s.target) == (Space::Line, Target::Increment)),
+            44.9,
+        ),
+        part(
+            "angle, change",
+            of(&|s| (s.space, s.target) == (Space::Circle, Target::Increment)),
+            57.2,
+        ),
+        part("sine and cosine of an angle predicted by its change", turned, 53.2),
+        part("angle, next sine and cosine", of(&absolute), 92.8),
+        part("its limits or its observed change", angles, 155.6),
+        part(
+            "planar pose",
+            usize::from(matches!(structure.symmetry(), Symmetry::Se2 { .. })),
+            35.1,
+        ),
+        part("dense block", blocks.len(), 331.2),
+        part("factor of a dense block", blocks.iter().map(|(factors, _)| factors).sum(), 92.1),
+        part("dense block and output", blocks.len() * outputs, 31.0),
+        part(
+            "dense coefficient of the first 16 of a block",
+            blocks.iter().map(|(_, size)| size.min(&16) * outputs).sum(),
+            6.6,
+        ),
+        part("dense coefficient", blocks.iter().map(|(_, size)| size * outputs).sum(), 20.3),
+    ]
 }

@@ -7,12 +7,12 @@
 
 use std::collections::BTreeMap;
 
-use firmware_core::{Number, SparseTerms};
 use firmware_core::capacity::{MAX_BASIS, MAX_BLOCKS, MAX_INPUTS, MAX_OBSERVABLES, MAX_STATES};
 use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source, fourier};
 use firmware_core::model::{
     Input, ModelError, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
+use firmware_core::{Number, SparseTerms};
 
 use crate::cost::Cost;
 use crate::robot::Robot;
