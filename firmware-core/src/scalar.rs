@@ -75,7 +75,7 @@ pub trait Scalar:
 
     /// The same number; `f32` to `f64` is exact.
     fn from_f32(value: f32) -> Self;
-    /// `(sin, cos)` of an angle in radians. In `f32` our own polynomials, off by at most 1.0e-7 for
+    /// `(sin, cos)` of an angle in radians. In `f32` our own polynomials, off by at most 9.3e-8 for
     /// angles in (−π, π]; larger ones are [wrapped](Self::wrap) first, which turns them by up to
     /// 2.8e-8 of their size, less than what rounding them to `f32` has turned them by.
     fn sin_cos(self) -> (Self, Self) {
