@@ -44,8 +44,8 @@ impl<S: Scalar> PartialEq for History<S> {
         let kept = |history: &Self| (history.layout, history.kept, history.filled);
         let ((first, count), (of_other, _)) = (self.kept, other.kept);
         kept(self) == kept(other)
-            && self.registers.from(first, count.into())
-                == other.registers.from(of_other, count.into())
+            && self.registers.slice(first, count.into())
+                == other.registers.slice(of_other, count.into())
     }
 }
 
@@ -100,7 +100,7 @@ impl<S: Scalar> History<S> {
             true => self.increment(structure, next),
             false => [S::ZERO; MAX_STATES],
         };
-        for (i, to) in self.registers.from_mut(INPUTS, layout.inputs()).iter_mut().enumerate() {
+        for (i, to) in self.registers.slice_mut(INPUTS, layout.inputs()).iter_mut().enumerate() {
             *to = at(input, i as u8);
         }
         let mut staged = [[S::ZERO; GROUP]; MAX_STATES];

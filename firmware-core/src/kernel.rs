@@ -541,7 +541,7 @@ impl Program {
     /// The values of all observables of a dense model, which have been scaled.
     #[inline]
     pub(crate) fn values<'r, S: Scalar>(&self, registers: &'r Registers<S>) -> &'r [S] {
-        registers.from(self.first, self.scaled.len())
+        registers.slice(self.first, self.scaled.len())
     }
 
     /// The outputs of a sparse model, whose observables have been scaled up to register `next`:
@@ -572,7 +572,7 @@ impl Program {
             next = next.wrapping_add(1);
         }
         let cells = registers.cells();
-        let made = cells.from(next, terms.len());
+        let made = cells.slice(next, terms.len());
         match outputs.len() {
             0 => {}
             1 => make_one(cells, terms, made, coefficients, outputs),

@@ -204,7 +204,7 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         }
         expect("inputs", layout.inputs(), input.len())?;
         let registers = state.history.registers_mut();
-        for (register, u) in registers.from_mut(INPUTS, input.len()).iter_mut().zip(input) {
+        for (register, u) in registers.slice_mut(INPUTS, input.len()).iter_mut().zip(input) {
             if !u.is_finite() {
                 return expect_inputs(input.len(), input);
             }

@@ -64,13 +64,13 @@ impl<S: Scalar> Registers<S> {
 
     /// `count` registers from `first` on, as far as there are.
     #[inline(always)]
-    pub(crate) fn from(&self, first: u8, count: usize) -> &[S] {
+    pub(crate) fn slice(&self, first: u8, count: usize) -> &[S] {
         self.0.get(usize::from(first)..).and_then(|rest| rest.get(..count)).unwrap_or(&[])
     }
 
     /// The same, to be written.
     #[inline(always)]
-    pub(crate) fn from_mut(&mut self, first: u8, count: usize) -> &mut [S] {
+    pub(crate) fn slice_mut(&mut self, first: u8, count: usize) -> &mut [S] {
         let rest = self.0.get_mut(usize::from(first)..).unwrap_or_default();
         rest.get_mut(..count).unwrap_or_default()
     }
@@ -122,7 +122,7 @@ impl<'r, S: Scalar> Cells<'r, S> {
 
     /// `count` registers from `first` on, as far as there are.
     #[inline(always)]
-    pub(crate) fn from(self, first: u8, count: usize) -> &'r [Cell<S>] {
+    pub(crate) fn slice(self, first: u8, count: usize) -> &'r [Cell<S>] {
         self.0.get(usize::from(first)..).and_then(|rest| rest.get(..count)).unwrap_or(&[])
     }
 }
