@@ -41,7 +41,8 @@
 //! cut, and only provides functions: v, v², …, vᵖ or sin φ, cos φ, …, sin pφ, cos pφ, numbered from 0
 //! over all factors in order. Entry k = 1 … T of the terms is a parent p < k and a function g:
 //! term k is term p times function g, and term 0 the constant 1, which has the first coefficient of
-//! every output. T is at most 255.
+//! every output. T is at most 255, and the model has to get by with the
+//! [registers](crate::capacity::REGISTERS).
 //!
 //! | offset in the error bounds | size | field |
 //! |---|---|---|

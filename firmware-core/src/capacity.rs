@@ -36,8 +36,8 @@ pub const MAX_SPARSE_TERMS: usize = 255;
 /// The last step that error bounds may be given for.
 pub const MAX_HORIZON: u32 = 65_535;
 
-/// Numbers that a step of a model reads and writes: its history and, of a sparse model, standardised
-/// observables, functions and terms . They are numbered by a byte.
+/// Numbers that a step of a model reads and writes: the inputs, its history, centred or scaled
+/// observables, and, of a sparse model, powers, harmonics and terms. They are numbered by a byte.
 pub const REGISTERS: usize = 256;
 
 const _: () = assert!(MAX_FUNCTIONS <= 256 && MAX_SPARSE_TERMS <= 255, "indices are bytes");

@@ -22,6 +22,10 @@
 //! 2. The terms in order: t₀ = 1 and tₖ = t_p · f_g for entry k = (p, g). A product with the constant
 //!    is the function itself.
 //! 3. Every output: c₀, then c₀ + c₁ · t₁, and so on in the order of the terms.
+//!
+//! A [`Program`] is the chain translated into [registers](crate::registers) when a model is loaded:
+//! every power and every term is the product of two of them. A term is made once and multiplied
+//! with the coefficients of up to four outputs while it is at hand.
 
 use core::cell::Cell;
 

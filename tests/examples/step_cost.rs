@@ -212,6 +212,10 @@ fn main() -> ExitCode {
             row.predicted = products.sum();
         }
     }
+    println!("{:<52} instructions", "part of a step");
+    for part in &rows[0].parts {
+        println!("{:<52} {:>12.1}", part.name, part.each);
+    }
     println!("{:<14} {:>8} {:>9} {:>7} {:>7}", "model", "counted", "predicted", "off", "bytes");
     for row in &rows {
         let Row { name, measured, predicted, bytes, .. } = row;

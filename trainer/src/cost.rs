@@ -35,6 +35,39 @@ impl Cost {
 }
 
 /// Executed instructions of one step on a Cortex-M4F.
+///
+/// ```
+/// use firmware_core::SparseTerms;
+/// use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
+/// use firmware_core::model::{Input, ModelRepr, Provenance, Space, State, Structure};
+/// use firmware_core::model::{Symmetry, Target};
+///
+/// // A planar robot with 12 observables, each of them a term: two inputs at the present and the three
+/// // samples before, the changes of the pose before the present sample, and one of them before that.
+/// let state = |name, space| State {
+///     name, unit: "", space, target: Target::Increment, limit: [f32::MIN, f32::MAX],
+/// };
+/// let input = |name| Input { name, unit: "", range: [-1.0, 1.0] };
+/// let inputs = (0..8).map(|i| (Source::Input(i % 2), i / 2));
+/// let changes = [(0, 1), (1, 1), (2, 1), (2, 2)].map(|(i, lag)| (Source::Increment(i), lag));
+/// let observable = |(source, lag)| Observable { source, lag, centre: 0.0, gain: 1.0 };
+/// let structure = Structure::try_from(ModelRepr {
+///     robot: "planar",
+///     sample_time_s: 0.1,
+///     states: [state("x", Space::Line), state("y", Space::Line), state("phi", Space::Circle)]
+///         .into_iter().collect(),
+///     inputs: [input("v"), input("omega")].into_iter().collect(),
+///     symmetry: Symmetry::Se2 { x: 0, y: 1, heading: 2 },
+///     observables: inputs.chain(changes).map(observable).collect(),
+///     factors: (0..12).map(|observable| Factor { observable, basis: Basis::Hermite, order: 1 })
+///         .collect(),
+///     blocks: [Block { factors: 1, max_degree: 0 }; 12].into_iter().collect(),
+///     provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+/// }).unwrap();
+/// let terms: Vec<[u8; 2]> = (0..12).map(|function| [0, function]).collect();
+/// let terms = SparseTerms::new(structure.dictionary(), &terms).unwrap();
+/// assert_eq!(trainer::cost::instructions(&structure, Some(terms)), 875);
+/// ```
 pub fn instructions(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> u32 {
     let parts = parts(structure, terms);
     parts.iter().map(|part| part.count as f32 * part.each).sum::<f32>().round() as u32
