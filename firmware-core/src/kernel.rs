@@ -182,6 +182,31 @@ fn rows<S: Scalar, const RADIX: usize, const STRIDE: usize>(
     let (groups, _) = rows.as_chunks::<RADIX>();
     let (to, _) = to.as_chunks_mut::<STRIDE>();
     for (out, group) in to.iter_mut().zip(groups) {
+        // The same operations column by column where there are no vector registers: a row of sums
+        // would go through memory.
+        if cfg!(target_arch = "arm") {
+            match &group[..] {
+                [a, b] => {
+                    for ((to, a), b) in out.iter_mut().zip(a).zip(b) {
+                        *to = *a + v * *b;
+                    }
+                    continue;
+                }
+                [a, b, c] => {
+                    for (((to, a), b), c) in out.iter_mut().zip(a).zip(b).zip(c) {
+                        *to = *a + v * (*b + v * *c);
+                    }
+                    continue;
+                }
+                [a, b, c, d] => {
+                    for ((((to, a), b), c), d) in out.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+                        *to = *a + v * (*b + v * (*c + v * *d));
+                    }
+                    continue;
+                }
+                _ => {}
+            }
+        }
         let mut sum = group.last().copied().unwrap_or([S::ZERO; STRIDE]);
         for row in group.iter().rev().skip(1) {
             for (hi, lo) in sum.iter_mut().zip(row) {

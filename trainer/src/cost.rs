@@ -128,7 +128,7 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
     let angles = angles.count();
     [
         part("step", 1, 178.3),
-        part("step of a dense model", usize::from(dense), -99.5),
+        part("step of a dense model", usize::from(dense), -103.3),
         part("input", structure.inputs().len(), 11.4),
         part("observable and its range", observables.len(), 13.7),
         part("observable that is centred or scaled", scaled, 19.9),
@@ -169,14 +169,14 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
             usize::from(matches!(structure.symmetry(), Symmetry::Se2 { .. })),
             35.1,
         ),
-        part("dense block", blocks.len(), 331.2),
-        part("factor of a dense block", blocks.iter().map(|(factors, _)| factors).sum(), 92.1),
-        part("dense block and output", blocks.len() * outputs, 31.0),
+        part("dense block", blocks.len(), 341.7),
+        part("factor of a dense block", blocks.iter().map(|(factors, _)| factors).sum(), 74.3),
+        part("dense block and output", blocks.len() * outputs, 23.3),
         part(
             "dense coefficient of the first 16 of a block",
             blocks.iter().map(|(_, size)| size.min(&16) * outputs).sum(),
-            6.6,
+            14.2,
         ),
-        part("dense coefficient", blocks.iter().map(|(_, size)| size * outputs).sum(), 20.3),
+        part("dense coefficient", blocks.iter().map(|(_, size)| size * outputs).sum(), 6.8),
     ]
 }
