@@ -286,12 +286,12 @@ fn fitted(rows: &[Row]) -> Vec<f64> {
     let mut sums = vec![vec![0.0; n + 1]; n];
     for row in rows {
         let w = weight(row);
-        for i in 0..n {
-            let a = row.parts[i].count as f64 * w;
-            for j in 0..n {
-                sums[i][j] += a * row.parts[j].count as f64 * w;
+        for (own, part) in sums.iter_mut().zip(&row.parts) {
+            let a = part.count as f64 * w;
+            for (sum, other) in own.iter_mut().zip(&row.parts) {
+                *sum += a * other.count as f64 * w;
             }
-            sums[i][n] += a * row.measured * w;
+            own[n] += a * row.measured * w;
         }
     }
     for (i, row) in sums.iter_mut().enumerate() {
@@ -301,12 +301,11 @@ fn fitted(rows: &[Row]) -> Vec<f64> {
     for i in 0..n {
         let pivot = (i..n).max_by(|a, b| sums[*a][i].abs().total_cmp(&sums[*b][i].abs()));
         sums.swap(i, pivot.unwrap_or(i));
-        for j in 0..n {
+        let pivot = sums[i].clone();
+        for (j, row) in sums.iter_mut().enumerate() {
             if j != i {
-                let factor = sums[j][i] / sums[i][i];
-                for k in i..=n {
-                    sums[j][k] -= factor * sums[i][k];
-                }
+                let factor = row[i] / pivot[i];
+                row.iter_mut().zip(&pivot).for_each(|(to, from)| *to -= factor * from);
             }
         }
     }
