@@ -41,7 +41,8 @@
 //! cut, and only provides functions: v, v², …, vᵖ or sin φ, cos φ, …, sin pφ, cos pφ, numbered from 0
 //! over all factors in order. Entry k = 1 … T of the terms is a parent p < k and a function g:
 //! term k is term p times function g, and term 0 the constant 1, which has the first coefficient of
-//! every output. T is at most 255.
+//! every output. T is at most 255, and the model has to get by with the
+//! [registers](crate::capacity::REGISTERS).
 //!
 //! | offset in the error bounds | size | field |
 //! |---|---|---|
@@ -65,6 +66,7 @@ use crate::capacity::MAX_STATES;
 use crate::error_bounds::{ErrorBounds, ErrorBoundsError};
 use crate::model::{Model, ModelError, ModelRepr, Space, Structure};
 use crate::predictor::{PredictError, Predictor, PredictorState};
+use crate::sparse::SparseTerms;
 
 /// First bytes of a blob.
 pub const MAGIC: [u8; 4] = *b"KOOP";
@@ -556,6 +558,31 @@ pub fn emit(
     let checksum = checksum(blob);
     write(blob, 12, &checksum.to_le_bytes());
     Ok(end)
+}
+
+/// The length in bytes of the blob that [`emit`] writes for a model of this structure, dense or with
+/// these terms, with trained ranges or without, and without error bounds.
+pub fn size(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>, ranges: bool) -> usize {
+    let counter = postcard::ser_flavors::Size::default();
+    // Counting cannot fail.
+    let metadata = postcard::serialize_with_flavor(&structure.to_repr(), counter).unwrap_or(0);
+    let dictionary = structure.dictionary();
+    let row = terms.map_or(dictionary.dense_terms(), |terms| terms.count());
+    let numbers = [
+        structure.outputs().saturating_mul(row),
+        SelfTest::len(structure),
+        if ranges { dictionary.observables().len().saturating_mul(2) } else { 0 },
+    ];
+    let chain = terms.map_or(0, |terms| terms.entries().len().saturating_mul(2));
+    let sections = 3_usize.saturating_add(terms.is_some().into()).saturating_add(ranges.into());
+    let parts = [
+        HEADER,
+        sections.saturating_mul(ENTRY),
+        metadata.next_multiple_of(4),
+        chain.next_multiple_of(4),
+        numbers.into_iter().fold(0, usize::saturating_add).saturating_mul(4),
+    ];
+    parts.into_iter().fold(0, usize::saturating_add)
 }
 
 /// Lays sections one after the other and fills in the table.

@@ -28,12 +28,16 @@ pub const MAX_BASIS: usize = 2 * MAX_ORDER as usize + 1;
 /// Terms of all blocks together, those held by an earlier block counted again.
 pub const MAX_TERMS: usize = 4096;
 /// Basis functions of all factors of a sparse model, the constant not counted. They are numbered by
-/// a byte, and a step of a sparse model has room for all their values on the stack: 512 bytes in f32.
+/// a byte.
 pub const MAX_FUNCTIONS: usize = 128;
-/// Terms of a sparse model besides the constant. They are numbered by a byte, and a step of a sparse
-/// model has room for all their values on the stack: 1,024 bytes in f32.
+/// Terms of a sparse model besides the constant. They are numbered by a byte; how many there is room
+/// for beside the rest of a model depends on [`REGISTERS`], too.
 pub const MAX_SPARSE_TERMS: usize = 255;
 /// The last step that error bounds may be given for.
 pub const MAX_HORIZON: u32 = 65_535;
+
+/// Numbers that a step of a model reads and writes: the inputs, its history, centred or scaled
+/// observables, and, of a sparse model, powers, harmonics and terms. They are numbered by a byte.
+pub const REGISTERS: usize = 256;
 
 const _: () = assert!(MAX_FUNCTIONS <= 256 && MAX_SPARSE_TERMS <= 255, "indices are bytes");

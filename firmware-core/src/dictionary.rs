@@ -442,7 +442,7 @@ pub(crate) fn basis_functions<'o, S: Number>(
 
 /// The value of a factor's observable and of the one behind it.
 #[inline]
-pub(crate) fn observable_pair<S: Number>(factor: Factor, values: &[S]) -> (S, S) {
+pub(crate) fn observable_pair<S: Copy + Default>(factor: Factor, values: &[S]) -> (S, S) {
     let mut from = values.iter().skip(factor.observable.into()).copied();
     (from.next().unwrap_or_default(), from.next().unwrap_or_default())
 }

@@ -2,9 +2,9 @@
 //! outputs back to coordinates.
 
 use crate::Scalar;
-use crate::capacity::{MAX_INPUTS, MAX_LAG, MAX_STATES};
-use crate::dictionary::Source;
+use crate::capacity::MAX_STATES;
 use crate::model::{Space, Structure, Symmetry, Target};
+use crate::registers::{GROUP, INPUTS, Kind, Layout, Registers};
 
 /// One sample of the robot.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -13,52 +13,39 @@ pub struct Sample<S> {
     x: [S; MAX_STATES],
     sin: [S; MAX_STATES],
     cos: [S; MAX_STATES],
-    /// The increment that led here from the sample before.
-    increment: [S; MAX_STATES],
-    /// The input that acts from this sample to the next.
-    input: [S; MAX_INPUTS],
 }
 
 impl<S: Scalar> Sample<S> {
-    pub(crate) const ZERO: Self = Self {
-        x: [S::ZERO; MAX_STATES],
-        sin: [S::ZERO; MAX_STATES],
-        cos: [S::ONE; MAX_STATES],
-        increment: [S::ZERO; MAX_STATES],
-        input: [S::ZERO; MAX_INPUTS],
-    };
+    const ZERO: Self =
+        Self { x: [S::ZERO; MAX_STATES], sin: [S::ZERO; MAX_STATES], cos: [S::ONE; MAX_STATES] };
 }
 
-impl<S: Scalar> Sample<S> {
-    /// Takes over the coordinates of another sample, one number at a time: they have just been
-    /// written that way, and a wider load would have to wait for the stores.
-    #[inline]
-    fn set(&mut self, other: &Self, states: usize) {
-        let lists = [
-            (&mut self.x, &other.x),
-            (&mut self.sin, &other.sin),
-            (&mut self.cos, &other.cos),
-            (&mut self.increment, &other.increment),
-        ];
-        for (to, from) in lists {
-            for (to, from) in to.iter_mut().zip(from).take(states) {
-                *to = *from;
-            }
-        }
-    }
-}
-
-/// The present sample and the ones before it, as far back as a model may look.
-#[derive(Clone, Debug, PartialEq)]
+/// The present sample and what a model looks at of the ones before it.
+///
+/// It belongs to the models of one structure: to one that keeps other things it is empty.
+#[derive(Clone, Debug)]
 pub struct History<S> {
-    /// The newest first.
-    samples: [Sample<S>; MAX_LAG + 1],
+    registers: Registers<S>,
+    /// Which [`Layout`] the registers have, and what it keeps.
+    layout: u32,
+    kept: (u8, u8),
     filled: u8,
 }
 
 impl<S: Scalar> Default for History<S> {
     fn default() -> Self {
-        Self { samples: [Sample::ZERO; MAX_LAG + 1], filled: 0 }
+        Self { registers: Registers::new(), layout: 0, kept: (0, 0), filled: 0 }
+    }
+}
+
+/// What is kept is compared, not what a step has computed on the way.
+impl<S: Scalar> PartialEq for History<S> {
+    fn eq(&self, other: &Self) -> bool {
+        let kept = |history: &Self| (history.layout, history.kept, history.filled);
+        let ((first, count), (of_other, _)) = (self.kept, other.kept);
+        kept(self) == kept(other)
+            && self.registers.slice(first, count.into())
+                == other.registers.slice(of_other, count.into())
     }
 }
 
@@ -84,48 +71,63 @@ impl<S: Scalar> History<S> {
         self.filled = 0;
     }
 
+    /// How many samples there are for a model of this layout.
     #[inline]
-    fn newest(&self) -> &Sample<S> {
-        let [newest, ..] = &self.samples;
-        newest
+    pub(crate) fn ready(&self, layout: &Layout) -> usize {
+        if self.layout == layout.id { self.filled.into() } else { 0 }
+    }
+
+    #[inline]
+    pub(crate) fn registers(&self) -> &Registers<S> {
+        &self.registers
+    }
+
+    /// Where a step puts its inputs and what it computes: everything that is not kept.
+    #[inline]
+    pub(crate) fn registers_mut(&mut self) -> &mut Registers<S> {
+        &mut self.registers
     }
 
     /// Takes a measured sample. `input` acted from the present sample to it; before the first
     /// sample it is ignored.
     #[inline]
     pub fn push(&mut self, structure: &Structure<'_>, input: &[S], next: &Sample<S>) {
-        if structure.needs_increments() && self.filled > 0 {
-            let increment = structure.increment(self.newest(), next);
-            self.advance(structure, input, &Sample { increment, ..*next });
-        } else {
-            self.advance(structure, input, next);
+        let layout = structure.layout();
+        if self.layout != layout.id {
+            *self = Self { layout: layout.id, kept: layout.kept(), ..Self::default() };
         }
+        let increment = match layout.increments && self.filled > 0 {
+            true => self.increment(structure, next),
+            false => [S::ZERO; MAX_STATES],
+        };
+        for (i, to) in self.registers.slice_mut(INPUTS, layout.inputs()).iter_mut().enumerate() {
+            *to = at(input, i as u8);
+        }
+        let mut staged = [[S::ZERO; GROUP]; MAX_STATES];
+        let parts = next.x.iter().zip(increment).zip(&next.sin).zip(&next.cos);
+        for (to, (((x, increment), sin), cos)) in staged.iter_mut().zip(parts) {
+            *to = [*x, increment, *sin, *cos];
+        }
+        self.registers.advance(layout, &staged);
+        // Only what a later step may look at is counted.
+        let room = u8::try_from(structure.lag()).unwrap_or(u8::MAX).saturating_add(1);
+        self.filled = self.filled.saturating_add(1).min(room);
     }
 
-    /// Takes a predicted sample, as [`retract`](Self::retract) made it.
+    /// Coordinate `i` of the present sample.
     #[inline]
-    pub(crate) fn advance(&mut self, structure: &Structure<'_>, input: &[S], next: &Sample<S>) {
-        let [newest, ..] = &mut self.samples;
-        for (to, u) in newest.input.iter_mut().zip(input) {
-            *to = *u;
-        }
-        let kept = structure.lag().min(MAX_LAG);
-        if kept > 0 {
-            self.samples.copy_within(..kept, 1);
-        }
-        let [newest, ..] = &mut self.samples;
-        newest.set(next, structure.states().len());
-        // Only what a later step may look at is kept: another model is not shown stale samples.
-        let room = u8::try_from(kept).unwrap_or(u8::MAX).saturating_add(1);
-        self.filled = self.filled.saturating_add(1).min(room);
+    fn coordinate(&self, layout: &Layout, i: u8) -> S {
+        let present = self.registers.present(layout).get(usize::from(i));
+        let [x, _, sin, cos] = present.copied().unwrap_or_default();
+        if layout.kind(i).absolute_angle() { sin.atan2(cos) } else { x }
     }
 
     /// The present coordinates in `out`, shape `[states]`: angles in (−π, π] where the model
     /// predicts them absolutely, as they came or wrapped after a step otherwise.
     #[inline]
     pub fn coordinates(&self, structure: &Structure<'_>, out: &mut [S]) {
-        for (i, to) in out.iter_mut().enumerate().take(structure.states().len()) {
-            *to = structure.coordinate(self.newest(), i);
+        for (i, to) in (0..).zip(out.iter_mut().take(structure.states().len())) {
+            *to = self.coordinate(structure.layout(), i);
         }
     }
 
@@ -137,16 +139,10 @@ impl<S: Scalar> History<S> {
         structure: &'h Structure<'_>,
         input: &'h [S],
     ) -> impl Iterator<Item = S> + 'h {
-        structure.dictionary().observables().iter().map(move |o| {
-            let sample = |lag: u8| self.samples.get(usize::from(lag)).unwrap_or(self.newest());
-            match o.source {
-                Source::State(i) => at(&sample(o.lag).x, i),
-                Source::Sin(i) => at(&sample(o.lag).sin, i),
-                Source::Cos(i) => at(&sample(o.lag).cos, i),
-                Source::Increment(i) => at(&sample(o.lag.saturating_sub(1)).increment, i),
-                Source::Input(i) if o.lag == 0 => at(input, i),
-                Source::Input(i) => at(&sample(o.lag).input, i),
-            }
+        let layout = structure.layout();
+        layout.observables.iter().map(move |register| match register.checked_sub(INPUTS) {
+            Some(index) if *register < layout.present => at(input, index),
+            _ => self.registers.get(*register),
         })
     }
 
@@ -166,7 +162,7 @@ impl<S: Scalar> History<S> {
     pub fn targets(&self, structure: &Structure<'_>, next: &Sample<S>, out: &mut [S]) {
         let increments = structure.states().iter().any(|s| s.target == Target::Increment);
         let increment = match increments {
-            true => structure.increment(self.newest(), next),
+            true => self.increment(structure, next),
             false => [S::ZERO; MAX_STATES],
         };
         let mut to = out.iter_mut();
@@ -193,91 +189,139 @@ impl<S: Scalar> History<S> {
     /// not finite, an absolute angle has lost its direction, or a coordinate leaves its limit.
     #[inline]
     pub fn retract(&self, structure: &Structure<'_>, outputs: &[S]) -> Option<Sample<S>> {
+        let mut staged = [[S::ZERO; GROUP]; MAX_STATES];
+        self.stage(structure.layout(), outputs, &mut staged)?;
         let mut next = Sample::ZERO;
-        self.retract_into(structure, outputs, &mut next)?;
+        let parts = next.x.iter_mut().zip(&mut next.sin).zip(&mut next.cos);
+        for (((x, sin), cos), staged) in parts.zip(staged) {
+            [*x, _, *sin, *cos] = staged;
+        }
         Some(next)
     }
 
-    /// [`retract`](Self::retract) into a sample that is still [`Sample::ZERO`].
-    #[inline]
-    pub(crate) fn retract_into(
+    /// The next sample from the operator's outputs as the registers hold it, four numbers per
+    /// coordinate, in `next`. Nothing that is kept changes. `None` as in [`retract`](Self::retract).
+    #[inline(always)]
+    pub(crate) fn stage(
         &self,
-        structure: &Structure<'_>,
+        layout: &Layout,
         outputs: &[S],
-        next: &mut Sample<S>,
+        next: &mut [[S; GROUP]; MAX_STATES],
     ) -> Option<()> {
-        let present = self.newest();
+        let registers = &self.registers;
+        if let Some(pose) = layout.pose {
+            let (s, c) = (registers.get(pose.sin), registers.get(pose.cos));
+            let (ahead, left) = (at(outputs, pose.ahead), at(outputs, pose.left));
+            let [x, ..] = next.get_mut(usize::from(pose.x))?;
+            *x = c * ahead - s * left;
+            let [y, ..] = next.get_mut(usize::from(pose.y))?;
+            *y = s * ahead + c * left;
+        }
         let mut outputs = outputs.iter().copied();
-        for (i, state) in structure.states().iter().enumerate() {
+        let present = registers.present(layout);
+        for ((place, next), present) in layout.states.iter().zip(next).zip(present) {
             let z = outputs.next()?;
-            let (x, sin, cos) = (next.x.get_mut(i)?, next.sin.get_mut(i)?, next.cos.get_mut(i)?);
-            match (state.target, state.space) {
-                (Target::Increment, space) => {
+            let ([from, ..], [to, change, sin, cos]) = (present, next);
+            let x = match place.kind {
+                Kind::Line => {
+                    *change = z - *from;
+                    z
+                }
+                Kind::Increment => {
+                    *change = z;
+                    z + *from
+                }
+                Kind::Pose => {
+                    *change = z;
+                    *to + *from
+                }
+                Kind::AngleIncrement | Kind::AngleIncrementTrigonometric => {
                     // Hundreds of turns within a step would only look fine once they are wrapped.
-                    if space == Space::Circle && z.abs() > S::from_f32(LONG) {
+                    if z.abs() > S::from_f32(LONG) {
                         return None;
                     }
-                    *x = z;
-                    *next.increment.get_mut(i)? = z;
-                }
-                (Target::Absolute, Space::Line) => *x = z,
-                (Target::Absolute, Space::Circle) => {
-                    let c = outputs.next()?;
-                    let radius = (z * z + c * c).sqrt();
-                    // Far from the circle the direction means nothing; also catches NaN.
-                    if !(radius > S::from_f32(1.0 / LONG) && radius < S::from_f32(LONG)) {
-                        return None;
+                    *change = z;
+                    let x = (z + *from).wrap();
+                    if place.kind == Kind::AngleIncrementTrigonometric {
+                        (*sin, *cos) = x.sin_cos_within();
                     }
-                    let shrink = S::ONE / radius;
-                    (*sin, *cos) = (z * shrink, c * shrink);
+                    x
                 }
-            }
-        }
-        if let Symmetry::Se2 { x, y, heading } = structure.symmetry() {
-            let (s, c) = (at(&present.sin, heading), at(&present.cos, heading));
-            let (ahead, left) = (at(&next.x, x), at(&next.x, y));
-            *next.x.get_mut(usize::from(x))? = c * ahead - s * left;
-            *next.x.get_mut(usize::from(y))? = s * ahead + c * left;
-        }
-        for (i, state) in structure.states().iter().enumerate() {
-            let x = next.x.get_mut(i)?;
-            let absolute_angle = (state.target, state.space) == (Target::Absolute, Space::Circle);
-            if state.target == Target::Increment {
-                *x = *x + present.x.get(i).copied()?;
-            }
-            if state.space == Space::Circle && !absolute_angle {
-                *x = x.wrap();
-                if structure.needs_trigonometry(i) {
-                    (*next.sin.get_mut(i)?, *next.cos.get_mut(i)?) = x.sin_cos();
+                Kind::Circle => {
+                    [*sin, *cos] = on_circle([z, outputs.next()?])?;
+                    continue;
                 }
-            }
-            let [low, high] = state.limit.map(S::from_f32);
-            let value = if !absolute_angle {
-                *x
-            } else if low > -S::PI || high < S::PI {
-                at(&next.sin, i as u8).atan2(at(&next.cos, i as u8))
-            } else {
-                // A limit that no angle leaves is not worth an arc tangent.
-                continue;
+                Kind::Angle => {
+                    [*sin, *cos] = on_circle([z, outputs.next()?])?;
+                    let [_, _, from_sin, from_cos] = present;
+                    let x = sin.atan2(*cos);
+                    *change = (x - from_sin.atan2(*from_cos)).wrap();
+                    x
+                }
             };
-            if !(value >= low && value <= high && value.is_finite()) {
+            let [low, high] = place.limit.map(S::from_f32);
+            // Catches NaN and, as limits are finite, infinity.
+            if !(x >= low && x <= high) {
                 return None;
             }
-        }
-        if structure.needs_increments() {
-            for (i, state) in structure.states().iter().enumerate() {
-                if state.target == Target::Absolute {
-                    *next.increment.get_mut(i)? = structure.change(present, next, i);
-                }
-            }
+            *to = x;
         }
         Some(())
+    }
+
+    /// Takes the sample that [`stage`](Self::stage) made.
+    #[inline(always)]
+    pub(crate) fn advance(&mut self, layout: &Layout, next: &[[S; GROUP]; MAX_STATES]) {
+        self.registers.advance(layout, next);
+    }
+
+    /// The increments of all coordinates from the present sample to another: wrapped on S¹, the pose
+    /// of an se(2)-symmetric model in the frame of the present one.
+    #[inline]
+    fn increment(&self, structure: &Structure<'_>, to: &Sample<S>) -> [S; MAX_STATES] {
+        let mut increment = [S::ZERO; MAX_STATES];
+        let layout = structure.layout();
+        for (i, (d, place)) in (0..).zip(increment.iter_mut().zip(&layout.states)) {
+            let to = match place.kind.absolute_angle() {
+                // Two arc tangents for nothing if no one reads the change of an absolute angle.
+                true if !layout.increments => continue,
+                true => at(&to.sin, i).atan2(at(&to.cos, i)),
+                false => at(&to.x, i),
+            };
+            let change = to - self.coordinate(layout, i);
+            let circle = structure.states().get(usize::from(i)).map(|s| s.space);
+            *d = if circle == Some(Space::Circle) { change.wrap() } else { change };
+        }
+        if let Symmetry::Se2 { x, y, heading } = structure.symmetry() {
+            let present = self.registers.present(layout).get(usize::from(heading));
+            let [_, _, s, c] = present.copied().unwrap_or_default();
+            let (dx, dy) = (at(&increment, x), at(&increment, y));
+            if let Some(ahead) = increment.get_mut(usize::from(x)) {
+                *ahead = c * dx + s * dy;
+            }
+            if let Some(left) = increment.get_mut(usize::from(y)) {
+                *left = c * dy - s * dx;
+            }
+        }
+        increment
     }
 }
 
 /// How far from the circle (sin, cos) may be, as a factor, and how far an angle may turn within a
 /// step \[rad\], before a prediction counts as diverged.
 const LONG: f32 = 1e3;
+
+/// Sine and cosine, back on the circle; `None` if they have lost their direction.
+#[inline(never)]
+fn on_circle<S: Scalar>([s, c]: [S; 2]) -> Option<[S; 2]> {
+    let square = s * s + c * c;
+    // Far from the circle the direction means nothing; also catches NaN.
+    if !(square > S::from_f32(1.0 / (LONG * LONG)) && square < S::from_f32(LONG * LONG)) {
+        return None;
+    }
+    let shrink = square.reciprocal_root();
+    Some([s * shrink, c * shrink])
+}
 
 impl Structure<'_> {
     /// A sample from coordinates, shape `[states]`, angles in radians; missing ones are 0.
@@ -298,50 +342,5 @@ impl Structure<'_> {
                 (*sin, *cos) = value.sin_cos();
             }
         }
-    }
-
-    #[inline]
-    fn coordinate<S: Scalar>(&self, sample: &Sample<S>, i: usize) -> S {
-        let absolute_angle = self
-            .states()
-            .get(i)
-            .is_some_and(|s| (s.target, s.space) == (Target::Absolute, Space::Circle));
-        let i = i as u8;
-        if absolute_angle { at(&sample.sin, i).atan2(at(&sample.cos, i)) } else { at(&sample.x, i) }
-    }
-
-    /// The change of a coordinate, wrapped on S¹.
-    #[inline]
-    fn change<S: Scalar>(&self, from: &Sample<S>, to: &Sample<S>, i: usize) -> S {
-        let change = self.coordinate(to, i) - self.coordinate(from, i);
-        match self.states().get(i).map(|s| s.space) {
-            Some(Space::Circle) => change.wrap(),
-            _ => change,
-        }
-    }
-
-    /// The increments of all coordinates from one sample to the next: wrapped on S¹, the pose of an
-    /// se(2)-symmetric model in the frame of `from`.
-    #[inline]
-    fn increment<S: Scalar>(&self, from: &Sample<S>, to: &Sample<S>) -> [S; MAX_STATES] {
-        let mut increment = [S::ZERO; MAX_STATES];
-        for (i, (d, state)) in increment.iter_mut().zip(self.states()).enumerate() {
-            // Two arc tangents for nothing if no one reads the change of an absolute angle.
-            let absolute_angle = (state.target, state.space) == (Target::Absolute, Space::Circle);
-            if !absolute_angle || self.needs_increments() {
-                *d = self.change(from, to, i);
-            }
-        }
-        if let Symmetry::Se2 { x, y, heading } = self.symmetry() {
-            let (s, c) = (at(&from.sin, heading), at(&from.cos, heading));
-            let (dx, dy) = (at(&increment, x), at(&increment, y));
-            if let Some(ahead) = increment.get_mut(usize::from(x)) {
-                *ahead = c * dx + s * dy;
-            }
-            if let Some(left) = increment.get_mut(usize::from(y)) {
-                *left = c * dy - s * dx;
-            }
-        }
-        increment
     }
 }

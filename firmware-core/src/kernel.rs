@@ -22,18 +22,31 @@
 //! 2. The terms in order: t₀ = 1 and tₖ = t_p · f_g for entry k = (p, g). A product with the constant
 //!    is the function itself.
 //! 3. Every output: c₀, then c₀ + c₁ · t₁, and so on in the order of the terms.
+//!
+//! A [`Program`] is the chain translated into [registers](crate::registers) when a model is loaded:
+//! every power and every term is the product of two of them. A term is made once and multiplied
+//! with the coefficients of up to four outputs while it is at hand.
+
+use core::cell::Cell;
 
 use heapless::Vec;
 
 // Sizes of a checked dictionary are small numbers: the wrapping arithmetic below never wraps, and is
 // there because it cannot panic.
 
-use crate::capacity::{MAX_BASIS, MAX_BLOCK_FACTORS, MAX_FUNCTIONS, MAX_SPARSE_TERMS};
-use crate::dictionary::{Basis, Factor, basis_functions, block_size, observable_pair, turn};
+use crate::capacity::{
+    MAX_BASIS, MAX_BLOCK_FACTORS, MAX_FUNCTIONS, MAX_OBSERVABLES, MAX_SPARSE_TERMS, REGISTERS,
+};
+use crate::dictionary::{
+    Basis, DictionaryError, Factor, Observable, basis_functions, block_size, observable_pair, turn,
+};
+use crate::model::{ModelError, Structure};
+use crate::registers::{Cells, INPUTS, NOWHERE, ONE, Registers};
+use crate::sparse::{SparseError, SparseTerms};
 use crate::{Number, Scalar};
 
 /// Coefficients of the last factors, which are folded slowest first.
-const REGISTERS: usize = 16;
+const AT_ONCE: usize = 16;
 /// Coefficients are folded on the stack in tiles that have at most this many results after the
 /// first axis.
 const ROOM: usize = 64;
@@ -169,6 +182,31 @@ fn rows<S: Scalar, const RADIX: usize, const STRIDE: usize>(
     let (groups, _) = rows.as_chunks::<RADIX>();
     let (to, _) = to.as_chunks_mut::<STRIDE>();
     for (out, group) in to.iter_mut().zip(groups) {
+        // The same operations column by column where there are no vector registers: a row of sums
+        // would go through memory.
+        if cfg!(target_arch = "arm") {
+            match &group[..] {
+                [a, b] => {
+                    for ((to, a), b) in out.iter_mut().zip(a).zip(b) {
+                        *to = *a + v * *b;
+                    }
+                    continue;
+                }
+                [a, b, c] => {
+                    for (((to, a), b), c) in out.iter_mut().zip(a).zip(b).zip(c) {
+                        *to = *a + v * (*b + v * *c);
+                    }
+                    continue;
+                }
+                [a, b, c, d] => {
+                    for ((((to, a), b), c), d) in out.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+                        *to = *a + v * (*b + v * (*c + v * *d));
+                    }
+                    continue;
+                }
+                _ => {}
+            }
+        }
         let mut sum = group.last().copied().unwrap_or([S::ZERO; STRIDE]);
         for row in group.iter().rev().skip(1) {
             for (hi, lo) in sum.iter_mut().zip(row) {
@@ -197,7 +235,7 @@ pub(crate) fn contract<S: Scalar>(
     let (mut size, mut last) = (1_usize, 0_usize);
     for factor in factors.iter().rev() {
         let larger = size.wrapping_mul(factor.radix());
-        if larger > REGISTERS {
+        if larger > AT_ONCE {
             break;
         }
         (size, last) = (larger, last.wrapping_add(1));
@@ -348,34 +386,266 @@ pub(crate) fn chain<S: Number>(entries: &[[u8; 2]], functions: &[S], terms: &mut
     }
 }
 
-/// The outputs of a sparse model: `coefficients` has shape `[outputs, terms]`, `outputs` shape
-/// `[outputs]`.
+/// A Fourier factor of a sparse model: the registers of sine and cosine, and the order, 2 or more.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Harmonics {
+    sin: u8,
+    cos: u8,
+    order: u8,
+}
+
+/// Outputs that are summed at once while the terms are made; as many as leave the processor registers
+/// for everything else.
+const TOGETHER: usize = 4;
+
+/// Sums terms times coefficients for some outputs at once, so that every term is loaded once: the
+/// name of a term and how it is zipped with its coefficients; for every output the names of it, its
+/// coefficients and its sum.
+macro_rules! sum {
+    ($coefficients:ident, $outputs:ident, $count:expr, $terms:expr, $term:ident, $zipped:pat,
+     $($output:ident $row:ident $sum:ident),+) => {{
+        let mut rows = $coefficients.chunks_exact($count.wrapping_add(1).max(1));
+        $(let Some([$sum, $row @ ..]) = rows.next() else { return };
+        let mut $sum = *$sum;)+
+        for $zipped in $terms$(.zip($row))+ {
+            $($sum = $sum + *$row * $term;)+
+        }
+        if let [$($output,)+ ..] = $outputs {
+            $(*$output = $sum;)+
+        }
+    }};
+}
+
+/// A function that makes the terms and the first outputs from them.
+macro_rules! make {
+    ($name:ident, $term:ident, $zipped:pat, $($output:ident $row:ident $sum:ident),+) => {
+        #[inline(never)]
+        fn $name<S: Scalar>(
+            cells: Cells<'_, S>,
+            products: &[[u8; 2]],
+            made: &[Cell<S>],
+            coefficients: &[S],
+            outputs: &mut [S],
+        ) {
+            let terms = products.iter().zip(made).map(|([a, b], to)| {
+                let term = cells.get(*a) * cells.get(*b);
+                to.set(term);
+                term
+            });
+            sum!(coefficients, outputs, products.len(), terms, $term, $zipped,
+                $($output $row $sum),+);
+        }
+    };
+}
+
+/// How a step computes what is not in the history. Everything has a register, one after the other:
+///
+/// 1. observables that are centred or scaled; of a dense model all observables in order;
+/// 2. harmonics of a sparse model from the second on, then its powers from the second on, then its
+///    terms without the constant.
+///
+/// Powers and terms are products of two registers.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Program {
+    /// The first register that is computed.
+    first: u8,
+    /// Observables with a register of their own: index, and register of the raw value.
+    scaled: Vec<[u8; 2], MAX_OBSERVABLES>,
+    harmonics: Vec<Harmonics, { MAX_FUNCTIONS / 4 }>,
+    products: Vec<[u8; 2], { REGISTERS - INPUTS as usize }>,
+    /// Products that are powers, and not terms.
+    powers: u8,
+}
+
+impl Program {
+    /// Of a structure and the terms that have been checked against its dictionary.
+    pub(crate) fn new(
+        structure: &Structure<'_>,
+        terms: Option<SparseTerms<'_>>,
+    ) -> Result<Self, ModelError> {
+        let (layout, dictionary) = (structure.layout(), structure.dictionary());
+        let mut program = Self {
+            first: layout.end,
+            scaled: Vec::new(),
+            harmonics: Vec::new(),
+            products: Vec::new(),
+            powers: 0,
+        };
+        let mut next = usize::from(layout.end);
+        // Registers beyond the last are noticed at the end.
+        let byte = |register: usize| u8::try_from(register).unwrap_or(NOWHERE);
+        let mut registers: Vec<u8, MAX_OBSERVABLES> = Vec::new();
+        let observables = dictionary.observables().iter().zip(&layout.observables);
+        for (index, (o, register)) in observables.enumerate() {
+            let mut register = *register;
+            if terms.is_none() || (o.centre, o.gain) != (0.0, 1.0) {
+                let _ = program.scaled.push([index as u8, register]);
+                register = byte(next);
+                next = next.saturating_add(1);
+            }
+            let _ = registers.push(register);
+        }
+        let Some(terms) = terms else {
+            return if next <= REGISTERS {
+                Ok(program)
+            } else {
+                let (field, capacity) = ("registers", REGISTERS);
+                let found = next;
+                Err(ModelError::Dictionary(DictionaryError::TooLarge { field, capacity, found }))
+            };
+        };
+        // The register of every function, in order.
+        let mut functions: Vec<u8, MAX_FUNCTIONS> = Vec::new();
+        let factors = dictionary.factors().iter();
+        for factor in factors.clone() {
+            let (v, behind) = observable_pair(*factor, &registers);
+            let _ = functions.push(v);
+            if factor.basis == Basis::Fourier {
+                let _ = functions.push(behind);
+                if factor.order > 1 {
+                    let (sin, cos, order) = (v, behind, factor.order);
+                    let _ = program.harmonics.push(Harmonics { sin, cos, order });
+                }
+            }
+            for _ in 1..factor.order {
+                for _ in 0..if factor.basis == Basis::Fourier { 2 } else { 0 } {
+                    let _ = functions.push(byte(next));
+                    next = next.saturating_add(1);
+                }
+                if factor.basis == Basis::Hermite {
+                    // Its register is not known yet.
+                    let _ = functions.push(NOWHERE);
+                }
+            }
+        }
+        let mut place = functions.iter_mut();
+        for factor in factors {
+            let mut functions = place.by_ref().take(factor.radix().saturating_sub(1));
+            let Some(v) = functions.next().copied() else { continue };
+            let mut power = v;
+            for function in functions {
+                if factor.basis == Basis::Hermite {
+                    let _ = program.products.push([power, v]);
+                    power = byte(next);
+                    *function = power;
+                    next = next.saturating_add(1);
+                }
+            }
+        }
+        program.powers = program.products.len() as u8;
+        let first_term = next;
+        for [parent, function] in terms.entries() {
+            let parent = match parent.checked_sub(1) {
+                None => ONE,
+                Some(earlier) => byte(first_term.saturating_add(earlier.into())),
+            };
+            let function = functions.get(usize::from(*function)).copied().unwrap_or(NOWHERE);
+            let _ = program.products.push([parent, function]);
+            next = next.saturating_add(1);
+        }
+        if next > REGISTERS {
+            let (field, capacity, found) = ("registers", REGISTERS, next);
+            return Err(ModelError::Sparse(SparseError::TooLarge { field, capacity, found }));
+        }
+        Ok(program)
+    }
+
+    /// Observables that have a register of their own; returns the register behind them.
+    #[inline(always)]
+    pub(crate) fn scale<S: Scalar>(
+        &self,
+        observables: &[Observable],
+        registers: &mut Registers<S>,
+    ) -> u8 {
+        let mut next = self.first;
+        for [index, raw] in &self.scaled {
+            if let Some(o) = observables.get(usize::from(*index)) {
+                registers.set(next, o.value(registers.get(*raw)));
+            }
+            next = next.wrapping_add(1);
+        }
+        next
+    }
+
+    /// The values of all observables of a dense model, which have been scaled.
+    #[inline]
+    pub(crate) fn values<'r, S: Scalar>(&self, registers: &'r Registers<S>) -> &'r [S] {
+        registers.slice(self.first, self.scaled.len())
+    }
+
+    /// The outputs of a sparse model, whose observables have been scaled up to register `next`:
+    /// `coefficients` has shape `[outputs, terms]`, `outputs` shape `[outputs]`.
+    #[inline(always)]
+    pub(crate) fn outputs<S: Scalar>(
+        &self,
+        next: u8,
+        registers: &mut Registers<S>,
+        coefficients: &[S],
+        outputs: &mut [S],
+    ) {
+        let mut next = next;
+        for Harmonics { sin, cos, order } in &self.harmonics {
+            let first = (registers.get(*sin), registers.get(*cos));
+            let mut harmonic = first;
+            for _ in 1..*order {
+                harmonic = turn(harmonic, first);
+                registers.set(next, harmonic.0);
+                registers.set(next.wrapping_add(1), harmonic.1);
+                next = next.wrapping_add(2);
+            }
+        }
+        let (powers, terms) =
+            self.products.split_at_checked(self.powers.into()).unwrap_or_default();
+        for [a, b] in powers {
+            registers.set(next, registers.get(*a) * registers.get(*b));
+            next = next.wrapping_add(1);
+        }
+        let cells = registers.cells();
+        let made = cells.slice(next, terms.len());
+        match outputs.len() {
+            0 => {}
+            1 => make_one(cells, terms, made, coefficients, outputs),
+            2 => make_two(cells, terms, made, coefficients, outputs),
+            3 => make_three(cells, terms, made, coefficients, outputs),
+            _ => make_four(cells, terms, made, coefficients, outputs),
+        }
+        if outputs.len() > TOGETHER {
+            sum_others(made, coefficients, outputs);
+        }
+    }
+}
+
+/// The outputs beyond the first ones from the terms, two by two.
 #[inline(never)]
-pub(crate) fn contract_chain<S: Scalar>(
-    factors: &[Factor],
-    values: &[S],
-    entries: &[[u8; 2]],
-    coefficients: &[S],
-    outputs: &mut [S],
-) {
-    let mut of_factors = FunctionValues::new();
-    functions(factors, values, &mut of_factors);
-    let mut terms = TermValues::new();
-    chain(entries, &of_factors, &mut terms);
-    // Two outputs at a time load every term once and wait for no addition.
-    let (pairs, last) = outputs.as_chunks_mut::<2>();
-    let mut rest = coefficients;
-    for [first, second] in pairs {
-        let (a, others) = rest.split_at_checked(terms.len()).unwrap_or((rest, &[]));
-        let (b, others) = others.split_at_checked(terms.len()).unwrap_or((others, &[]));
-        rest = others;
-        let mut rows = terms.iter().zip(a).zip(b);
-        let Some(((_, a), b)) = rows.next() else { return };
-        (*first, *second) = rows.fold((*a, *b), |(x, y), ((t, a), b)| (x + *a * *t, y + *b * *t));
+fn sum_others<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
+    let row = terms.len().wrapping_add(1);
+    let mut rest = coefficients.get(row.wrapping_mul(TOGETHER)..).unwrap_or(&[]);
+    let (pairs, last) = outputs.get_mut(TOGETHER..).unwrap_or_default().as_chunks_mut::<2>();
+    for pair in pairs {
+        sum_two(terms, rest, pair);
+        rest = rest.get(row.wrapping_mul(2)..).unwrap_or(&[]);
     }
-    for output in last {
-        let mut row = terms.iter().zip(rest);
-        let Some((_, a)) = row.next() else { return };
-        *output = row.fold(*a, |x, (t, a)| x + *a * *t);
+    if !last.is_empty() {
+        sum_one(terms, rest, last);
     }
+}
+
+// Functions of their own, so that the loop over the terms has the processor's registers for itself.
+make!(make_four, t, ((((t, p), q), r), s), a p w, b q x, c r y, d s z);
+make!(make_three, t, (((t, p), q), r), a p w, b q x, c r y);
+make!(make_two, t, ((t, p), q), a p w, b q x);
+make!(make_one, t, (t, p), a p w);
+
+/// Two further outputs from the terms.
+#[inline(never)]
+fn sum_two<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
+    let values = terms.iter().map(Cell::get);
+    sum!(coefficients, outputs, terms.len(), values, t, ((t, p), q), a p w, b q x);
+}
+
+/// A further output from the terms.
+#[inline(never)]
+fn sum_one<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
+    let values = terms.iter().map(Cell::get);
+    sum!(coefficients, outputs, terms.len(), values, t, (t, p), a p w);
 }

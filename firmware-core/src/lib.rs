@@ -34,6 +34,7 @@
 //! | [`history`] | samples: from coordinates to observables, from outputs back to coordinates |
 //! | [`blob`] | the bytes of a model: layout, parse, emit |
 //! | [`predictor`] | `Predictor` (immutable) and `PredictorState`: step, rollout, held inputs |
+//! | `registers`, `kernel` (private) | where the numbers of a step lie, and how it computes them |
 //! | [`capacity`] | what there is room for |
 #![no_std]
 #![cfg_attr(
@@ -58,6 +59,7 @@ pub mod history;
 mod kernel;
 pub mod model;
 pub mod predictor;
+mod registers;
 mod scalar;
 pub mod sparse;
 

@@ -10,6 +10,8 @@ use crate::Scalar;
 use crate::capacity::{MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_STATES};
 use crate::dictionary::{Block, Dictionary, DictionaryError, Factor, Observable, Source};
 use crate::error_bounds::ErrorBounds;
+use crate::kernel::Program;
+use crate::registers::{GROUP, Layout};
 use crate::sparse::{SparseError, SparseTerms};
 
 /// Where a state coordinate lives.
@@ -188,8 +190,7 @@ pub struct Structure<'a> {
     lag: u8,
     /// Bit i: the sine and cosine of coordinate i are needed.
     trigonometric: u8,
-    /// Lagged increments are observed.
-    increments: bool,
+    layout: Layout,
 }
 
 impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
@@ -238,7 +239,7 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
 
         let dictionary =
             Dictionary::new(observables, factors, blocks).map_err(ModelError::Dictionary)?;
-        let (mut lag, mut increments) = (0_u8, false);
+        let mut lag = 0_u8;
         for (index, o) in dictionary.observables().iter().enumerate() {
             let space = |i: u8| states.get(usize::from(i)).map(|s| s.space);
             let free = |i: u8| !symmetry.excludes(i);
@@ -248,10 +249,7 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
                     trigonometric |= bit(i.into());
                     space(i) == Some(Space::Circle) && free(i) && (o.centre, o.gain) == (0.0, 1.0)
                 }
-                Source::Increment(i) => {
-                    increments = true;
-                    space(i).is_some() && o.lag > 0
-                }
+                Source::Increment(i) => space(i).is_some() && o.lag > 0,
                 Source::Input(i) => usize::from(i) < inputs.len(),
             };
             if !fits || usize::from(o.lag) > MAX_LAG {
@@ -262,6 +260,10 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
             }
             lag = lag.max(o.lag);
         }
+        let layout =
+            Layout::new(&states, inputs.len(), symmetry, dictionary.observables(), |coordinate| {
+                trigonometric & bit(coordinate) != 0
+            });
         Ok(Self {
             robot,
             sample_time_s,
@@ -273,7 +275,7 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
             outputs,
             lag,
             trigonometric,
-            increments,
+            layout,
         })
     }
 }
@@ -366,10 +368,29 @@ impl<'a> Structure<'a> {
         self.trigonometric & bit(coordinate) != 0
     }
 
-    /// Whether lagged increments are observed.
+    /// Where a history keeps everything.
     #[inline]
-    pub(crate) fn needs_increments(&self) -> bool {
-        self.increments
+    pub(crate) fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// Numbers of the history that a step moves on by one sample: a multiple of four.
+    pub fn delayed(&self) -> usize {
+        usize::from(self.layout.groups).saturating_mul(GROUP)
+    }
+
+    /// Coordinates, sines, cosines, changes and inputs of which earlier samples are kept.
+    pub fn delay_lines(&self) -> usize {
+        self.layout.heads.len()
+    }
+
+    /// Whether a model of this structure, dense or with these terms, gets by with the
+    /// [registers](crate::capacity::REGISTERS) there are.
+    ///
+    /// # Errors
+    /// [`ModelError`] with what it would take.
+    pub fn fits(&self, terms: Option<SparseTerms<'_>>) -> Result<(), ModelError> {
+        Program::new(self, terms).map(|_| ())
     }
 
     /// The metadata again, as a blob holds it.
@@ -400,8 +421,10 @@ impl<'a> Structure<'a> {
 pub struct Model<'a, S = f32> {
     structure: Structure<'a>,
     terms: Option<SparseTerms<'a>>,
+    /// How the registers are computed.
+    program: Program,
     coefficients: &'a [S],
-    ranges: Option<&'a [S]>,
+    ranges: Option<&'a [[S; 2]]>,
     error_bounds: Option<ErrorBounds<'a>>,
 }
 
@@ -485,7 +508,10 @@ impl<'a, S: Scalar> Model<'a, S> {
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
     ) -> Result<Self, ModelError> {
-        let model = Self { structure, terms, coefficients, ranges, error_bounds: None };
+        let program = Program::new(&structure, terms)?;
+        let pairs = ranges.map(|ranges| ranges.as_chunks().0);
+        let model =
+            Self { structure, terms, program, coefficients, ranges: pairs, error_bounds: None };
         let structure = &model.structure;
         let expected = structure.outputs().saturating_mul(model.coefficients_per_output());
         let mismatch =
@@ -537,6 +563,12 @@ impl<'a, S: Scalar> Model<'a, S> {
         self.terms
     }
 
+    /// How the registers are computed.
+    #[inline]
+    pub(crate) fn program(&self) -> &Program {
+        &self.program
+    }
+
     /// Coefficients per output: dense terms of the dictionary, or sparse terms with the constant.
     #[inline]
     pub fn coefficients_per_output(&self) -> usize {
@@ -552,7 +584,13 @@ impl<'a, S: Scalar> Model<'a, S> {
     /// Smallest and largest raw value of every observable in the training data.
     #[inline]
     pub fn ranges(&self) -> Option<&'a [S]> {
-        self.ranges
+        self.ranges.map(|pairs| pairs.as_flattened())
+    }
+
+    /// The same, `[smallest, largest]` of every observable; none if they are not known.
+    #[inline]
+    pub(crate) fn range_pairs(&self) -> &'a [[S; 2]] {
+        self.ranges.unwrap_or(&[])
     }
 
     /// How far off the predictions may be, if that was measured.

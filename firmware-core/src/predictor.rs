@@ -1,12 +1,12 @@
 //! Predicting: one step, or a rollout that lifts again at every step.
 
-use heapless::Vec;
-
 use crate::Scalar;
-use crate::capacity::{MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES};
-use crate::history::{History, Sample};
-use crate::kernel::{Scratch, contract, contract_chain};
+use crate::capacity::{MAX_OUTPUTS, MAX_STATES};
+use crate::dictionary::Dictionary;
+use crate::history::History;
+use crate::kernel::{Scratch, contract};
 use crate::model::Model;
+use crate::registers::{GROUP, INPUTS, Layout, Registers};
 
 /// The first time a rollout left the range that the model was trained in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,16 +55,33 @@ pub enum PredictError {
 }
 
 /// All that moves while a [`Predictor`] works.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct PredictorState<S = f32> {
     history: History<S>,
     step: u32,
     out_of_range: Option<OutOfRange>,
+    /// What the last step made on the way: the operator's outputs, and the next sample.
+    outputs: [S; MAX_OUTPUTS],
+    next: [[S; GROUP]; MAX_STATES],
+}
+
+/// What a step has made on the way is not compared.
+impl<S: Scalar> PartialEq for PredictorState<S> {
+    fn eq(&self, other: &Self) -> bool {
+        (&self.history, self.step, self.out_of_range)
+            == (&other.history, other.step, other.out_of_range)
+    }
 }
 
 impl<S: Scalar> Default for PredictorState<S> {
     fn default() -> Self {
-        Self { history: History::default(), step: 0, out_of_range: None }
+        Self {
+            history: History::default(),
+            step: 0,
+            out_of_range: None,
+            outputs: [S::ZERO; MAX_OUTPUTS],
+            next: [[S::ZERO; GROUP]; MAX_STATES],
+        }
     }
 }
 
@@ -158,7 +175,7 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     ) -> Result<(), PredictError> {
         let structure = self.model.structure();
         expect("coordinates", structure.states().len(), coordinates.len())?;
-        if !(state.history.is_empty() && applied.is_empty()) {
+        if !(state.history.ready(structure.layout()) == 0 && applied.is_empty()) {
             expect_inputs(structure.inputs().len(), applied)?;
         }
         if let Some(coordinate) = coordinates.iter().position(|x| !x.is_finite()) {
@@ -178,48 +195,44 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     /// [`PredictError::InputNotFinite`], [`PredictError::Diverged`]; the state is unchanged.
     #[inline]
     pub fn step(&self, state: &mut PredictorState<S>, input: &[S]) -> Result<(), PredictError> {
-        let structure = self.model.structure();
-        expect_inputs(structure.inputs().len(), input)?;
-        let (have, need) = (state.history.len(), structure.lag().saturating_add(1));
+        let (structure, program) = (self.model.structure(), self.model.program());
+        let layout = structure.layout();
+        let (have, need) = (state.history.ready(layout), structure.lag().saturating_add(1));
         if have < need {
+            expect_inputs(layout.inputs(), input)?;
             return Err(PredictError::NotReady { have, need });
+        }
+        expect("inputs", layout.inputs(), input.len())?;
+        let registers = state.history.registers_mut();
+        for (register, u) in registers.slice_mut(INPUTS, input.len()).iter_mut().zip(input) {
+            if !u.is_finite() {
+                return expect_inputs(input.len(), input);
+            }
+            *register = *u;
         }
         let step = state.step.saturating_add(1);
 
-        // One pass over the observables: their range, and their value for the dictionary.
-        let mut values: Vec<S, MAX_OBSERVABLES> = Vec::new();
-        let mut outside = None;
-        let mut ranges = self.model.ranges().map_or(&[][..], |r| r.as_chunks().0).iter();
-        let observables = structure.dictionary().observables();
-        let raw = state.history.raw(structure, input);
-        for (observable, (raw, o)) in raw.zip(observables).enumerate() {
-            if let Some([low, high]) = ranges.next()
-                && !(raw >= *low && raw <= *high)
-            {
-                outside = outside.or(Some(OutOfRange { step, observable }));
-            }
-            // A checked dictionary has no more observables.
-            let _ = values.push(o.value(raw));
+        let ranges = self.model.range_pairs();
+        let mut outside = 0;
+        for (register, [low, high]) in layout.observables.iter().zip(ranges) {
+            outside |= registers.get(*register).outside(*low, *high);
         }
-        let mut outputs = [S::ZERO; MAX_OUTPUTS];
-        let outputs = outputs.get_mut(..structure.outputs()).unwrap_or_default();
-        let (dictionary, mut coefficients) = (structure.dictionary(), self.model.coefficients());
-        if let Some(terms) = self.model.terms() {
-            let factors = dictionary.factors();
-            contract_chain(factors, &values, terms.entries(), coefficients, outputs);
+        let outputs = state.outputs.get_mut(..structure.outputs()).unwrap_or_default();
+        let (dictionary, coefficients) = (structure.dictionary(), self.model.coefficients());
+        let next = program.scale(dictionary.observables(), registers);
+        if self.model.terms().is_some() {
+            program.outputs(next, registers, coefficients, outputs);
         } else {
-            let (stride, mut scratch) = (dictionary.dense_terms(), Scratch::new());
-            for (_, factors) in dictionary.blocks() {
-                let used = contract(factors, &values, coefficients, stride, outputs, &mut scratch);
-                coefficients = coefficients.get(used..).unwrap_or(&[]);
-            }
+            dense(dictionary, program.values(registers), coefficients, outputs);
         }
-        let diverged = PredictError::Diverged { step };
-        let mut next = Sample::ZERO;
-        state.history.retract_into(structure, outputs, &mut next).ok_or(diverged)?;
+        let staged = state.history.stage(layout, outputs, &mut state.next);
+        staged.ok_or(PredictError::Diverged { step })?;
 
-        state.out_of_range = state.out_of_range.or(outside);
-        state.history.advance(structure, input, &next);
+        if outside >> 31 != 0 && state.out_of_range.is_none() {
+            let observable = first_outside(layout, state.history.registers(), ranges);
+            state.out_of_range = observable.map(|observable| OutOfRange { step, observable });
+        }
+        state.history.advance(layout, &state.next);
         state.step = step;
         Ok(())
     }
@@ -292,7 +305,33 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     }
 }
 
-#[inline]
+/// The first observable outside its range.
+#[cold]
+#[inline(never)]
+fn first_outside<S: Scalar>(
+    layout: &Layout,
+    registers: &Registers<S>,
+    ranges: &[[S; 2]],
+) -> Option<usize> {
+    layout.observables.iter().zip(ranges).position(|(register, [low, high])| {
+        let raw = registers.get(*register);
+        !(raw >= *low && raw <= *high)
+    })
+}
+
+/// The outputs of a dense model.
+#[inline(never)]
+fn dense<S: Scalar>(dictionary: &Dictionary, values: &[S], coefficients: &[S], outputs: &mut [S]) {
+    outputs.fill(S::ZERO);
+    let (stride, mut scratch) = (dictionary.dense_terms(), Scratch::new());
+    let mut coefficients = coefficients;
+    for (_, factors) in dictionary.blocks() {
+        let used = contract(factors, values, coefficients, stride, outputs, &mut scratch);
+        coefficients = coefficients.get(used..).unwrap_or(&[]);
+    }
+}
+
+#[inline(never)]
 fn expect_inputs<S: Scalar>(expected: usize, input: &[S]) -> Result<(), PredictError> {
     expect("inputs", expected, input.len())?;
     match input.iter().position(|u| !u.is_finite()) {

@@ -742,3 +742,60 @@ fn angles_have_limits_too() {
         assert_eq!(predictor.rollout_held(&mut state, &[0.0], &mut [0.0; 50]), Ok(()));
     }
 }
+
+/// A state belongs to what its model keeps: to a model that keeps other things it is empty, instead of
+/// showing it numbers that mean something else.
+#[test]
+fn a_state_of_another_structure_is_empty() {
+    let [lagged, se2] = [fixtures::lagged(), fixtures::se2_lagged()];
+    let ones = |repr| vec![0.01_f64; 16 * fixtures::width(&fixtures::structure(repr))];
+    let of = |repr: &ModelRepr<'static>, f: &[f64]| {
+        let structure = fixtures::structure(repr);
+        let count = structure.outputs() * fixtures::width(&structure);
+        Model::new(structure, &f[..count].to_vec().leak()[..], None).unwrap()
+    };
+    let (a, b) = (of(&lagged, &ones(&lagged)), of(&se2, &ones(&se2)));
+    let (a, b) = (Predictor::new(&a), Predictor::new(&b));
+    let mut state = fixtures::fill(&a, &mut Numbers(1));
+    let before = state.clone();
+    let need = b.model().structure().lag() + 1;
+    assert_eq!(b.step(&mut state, &[0.1, 0.2]), Err(PredictError::NotReady { have: 0, need }));
+    assert_eq!(state, before);
+    // It starts anew, without an applied input.
+    b.observe(&mut state, &[], &[1.0, 2.0, 3.0]).unwrap();
+    assert_eq!(state.history().len(), 1);
+}
+
+/// Every error leaves the state as it was, whatever had been computed by then.
+#[test]
+fn a_failed_step_changes_nothing() {
+    for repr in fixtures::all() {
+        let structure = fixtures::structure(&repr);
+        let m = structure.inputs().len();
+        let count = structure.outputs() * fixtures::width(&structure);
+        let coefficients: Vec<f64> =
+            (0..count).map(|i| if i % 2 == 0 { 0.3 } else { 0.01 }).collect();
+        let good = fixtures::model(structure.clone(), &coefficients, None).unwrap();
+        let predictor = Predictor::new(&good);
+        let mut state = fixtures::fill(&predictor, &mut Numbers(3));
+        let _ = predictor.step(&mut state, &Numbers(4).take_f64(m));
+        let before = state.clone();
+        let huge = vec![1e300_f64; count];
+        let diverging = fixtures::model(structure, &huge, None).unwrap();
+        let u = Numbers(5).take_f64(m);
+        let found = Predictor::new(&diverging).step(&mut state, &u);
+        assert!(matches!(found, Err(PredictError::Diverged { .. })), "{}: {found:?}", repr.robot);
+        assert_eq!(state, before, "{}", repr.robot);
+        let mut wrong = u.clone();
+        if let Some(last) = wrong.last_mut() {
+            *last = f64::NAN;
+            let found = predictor.step(&mut state, &wrong);
+            assert_eq!(found, Err(PredictError::InputNotFinite { input: m - 1 }));
+            assert_eq!(state, before, "{}", repr.robot);
+        }
+        // And the next step is that of the state before.
+        let mut other = before.clone();
+        assert_eq!(predictor.step(&mut state, &u), predictor.step(&mut other, &u));
+        assert_eq!(state, other, "{}", repr.robot);
+    }
+}

@@ -10,7 +10,7 @@ use bytes::{
     sections,
 };
 use firmware_core::blob::{self, EmitError, ParseError};
-use firmware_core::capacity::{MAX_FUNCTIONS, MAX_SPARSE_TERMS};
+use firmware_core::capacity::{MAX_FUNCTIONS, MAX_SPARSE_TERMS, REGISTERS};
 use firmware_core::dictionary::{Basis, Block, Dictionary, Factor, Source};
 use firmware_core::model::{
     Model, ModelError, ModelRepr, Space, State, Structure, Symmetry, Target,
@@ -136,7 +136,8 @@ proptest! {
         parts in fixtures::parts(), (x, u) in coordinates(), seed: u64,
     ) {
         let mut own = parts.into_iter().next().unwrap().0;
-        while own.iter().map(|f| f.radix()).product::<usize>() > MAX_SPARSE_TERMS {
+        // Room for the history and the powers is left.
+        while own.iter().map(|f| f.radix()).product::<usize>() > REGISTERS - 64 {
             own.pop();
         }
         prop_assume!(!own.is_empty());
@@ -589,7 +590,21 @@ fn sparse_capacities() {
     let products = (0..MAX_FUNCTIONS).map(|g| [1, g as u8]);
     let entries: Vec<[u8; 2]> = functions.chain(products).take(MAX_SPARSE_TERMS).collect();
     assert_eq!(entries.len(), MAX_SPARSE_TERMS);
-    let coefficients = Numbers(1).take_f64(8 * (MAX_SPARSE_TERMS + 1));
+    // There are not registers enough for all of it; with one term fewer than refused, it predicts.
+    let taken = |terms: usize| {
+        let terms = SparseTerms::new(structure.dictionary(), &entries[..terms]).unwrap();
+        structure.fits(Some(terms))
+    };
+    let Err(ModelError::Sparse(SparseError::TooLarge { field, capacity, found })) =
+        taken(MAX_SPARSE_TERMS)
+    else {
+        panic!()
+    };
+    assert_eq!((field, capacity), ("registers", REGISTERS));
+    let room = MAX_SPARSE_TERMS - (found - REGISTERS);
+    assert!(room > 64 && taken(room).is_ok() && taken(room + 1).is_err());
+    let (all, entries) = (entries.clone(), entries[..room].to_vec());
+    let coefficients = Numbers(1).take_f64(8 * (room + 1));
     let model = Model::new_sparse(structure.clone(), &entries, &coefficients, None).unwrap();
     let predictor = Predictor::new(&model);
     let mut state = fixtures::fill(&predictor, &mut Numbers(2));
@@ -610,7 +625,7 @@ fn sparse_capacities() {
     };
     let too_large =
         |field, capacity| SparseError::TooLarge { field, capacity, found: capacity + 1 };
-    let found = refused(structure.dictionary(), &[&entries[..], &[[0, 0]]].concat());
+    let found = refused(structure.dictionary(), &[&all[..], &[[0, 0]]].concat());
     assert_eq!(found, too_large("sparse terms", MAX_SPARSE_TERMS));
     orders[0] = 7;
     let found = refused(build(&orders).dictionary(), &[[0, 0]]);
@@ -625,8 +640,8 @@ fn sparse_capacities() {
     assert_eq!(found, ParseError::Model(ModelError::Sparse(expected)));
     // x⁺ = x + 0.5 x² u, then terms that do not matter.
     let mut sections = sections(&GOLDEN);
-    sections[1].2.resize(4 * 256, 0);
-    sections[3].2.resize(2 * 255, 0);
+    sections[1].2.resize(4 * 241, 0);
+    sections[3].2.resize(2 * 240, 0);
     assert!(parse(Slot::new(&assemble(&sections)).bytes()).is_ok());
 }
 

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use firmware_core::blob::{Aligned, ParseError};
 use firmware_core::{Predictor, PredictorState, parse, parse_for};
+use trainer::cost::Cost;
 use trainer::edmd;
 use trainer::export::{coordinate, export};
 use trainer::recording::{Recording, Visitor};
@@ -51,6 +52,18 @@ impl Blob {
     /// The blob and `extra` bytes behind it.
     fn bytes(&mut self, extra: usize) -> &mut [u8] {
         &mut self.room.0[..self.length + extra]
+    }
+}
+
+/// The trainer knows the length of a blob before it is written.
+#[test]
+fn the_length_is_known_beforehand() {
+    for folder in made_models() {
+        let mut blob = Blob::read(&folder);
+        let bytes = blob.bytes(0);
+        let model = parse(bytes).unwrap();
+        let cost = Cost::new(model.structure(), model.terms());
+        assert_eq!(cost.bytes as usize, bytes.len(), "{}", folder.display());
     }
 }
 

@@ -1,84 +1,182 @@
-//! What a sparse model costs on the controller: instructions of one step, bytes of its blob.
+//! What a model costs on the controller: instructions of one step, bytes of its blob.
+//!
+//! The instructions are a sum over the [`parts`] of a step, each with a number of instructions that
+//! was fitted to counts on an emulated Cortex-M4F. `firmware-sim/cortex-m/measure` counts again and
+//! compares; `measure --fit` prints new numbers. They hold for the worst path of a step that
+//! succeeds and stays in range: the first step that leaves it also looks for the observable, and an
+//! angle that turns beyond half a turn takes a remainder.
 
-/// Instructions of the parts of one step on a Cortex-M4F; placeholders until they are measured.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Constants {
-    /// Every step.
-    pub step: u32,
-    /// A basis function: a power, a sine or a cosine.
-    pub function: u32,
-    /// A term: one product of the chain.
-    pub term: u32,
-    /// A coefficient: one multiply-add of one output.
-    pub product: u32,
-    /// A number of the history that is moved by one sample.
-    pub lagged: u32,
-    /// Rotating the increments of a planar pose, with the sine and cosine of its heading.
-    pub se2: u32,
-    /// Sine and cosine of an angle that is predicted by its increment and enters the dictionary.
-    pub angle: u32,
-}
-
-/// Of a Cortex-M4F with FPU, about.
-pub const CORTEX_M4F: Constants =
-    Constants { step: 250, function: 6, term: 6, product: 3, lagged: 1, se2: 20, angle: 20 };
-
-/// What the cost depends on.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Shape {
-    /// State coordinates.
-    pub states: usize,
-    /// Inputs.
-    pub inputs: usize,
-    /// Columns of the operator.
-    pub outputs: usize,
-    /// Observables.
-    pub observables: usize,
-    /// Observables with a lag of 1 or more.
-    pub lagged: usize,
-    /// Functions of all factors, the constant not counted.
-    pub functions: usize,
-    /// Entries of the chain, the constant not counted.
-    pub terms: usize,
-    /// Angles predicted by increments that enter the dictionary.
-    pub angles: usize,
-    /// Whether the pose is se(2)-symmetric.
-    pub se2: bool,
-}
+use firmware_core::SparseTerms;
+use firmware_core::blob;
+use firmware_core::dictionary::{Basis, Factor, Source};
+use firmware_core::model::{Space, State, Structure, Symmetry, Target};
 
 /// What one model takes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Cost {
     /// Executed instructions of one step.
     pub instructions: u32,
-    /// Bytes of the blob.
+    /// Bytes of the blob, without error bounds.
     pub bytes: u32,
 }
 
-/// The cost of a sparse model.
+impl Cost {
+    /// Of a model that the controller refuses.
+    pub const REFUSED: Self = Self { instructions: u32::MAX, bytes: u32::MAX };
+
+    /// Of a model with trained ranges: dense, or with these terms.
+    pub fn new(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> Self {
+        let bytes = blob::size(structure, terms, true);
+        Self {
+            instructions: instructions(structure, terms),
+            bytes: u32::try_from(bytes).unwrap_or(u32::MAX),
+        }
+    }
+}
+
+/// Executed instructions of one step on a Cortex-M4F.
 ///
 /// ```
-/// use trainer::cost::{CORTEX_M4F, Shape, cost};
-/// let shape = Shape { states: 1, inputs: 1, outputs: 1, observables: 2, functions: 2, terms: 2, ..Shape::default() };
-/// assert_eq!(cost(&CORTEX_M4F, shape).instructions, 250 + 2 * 6 + 2 * 6 + 2 * 3);
+/// use firmware_core::SparseTerms;
+/// use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
+/// use firmware_core::model::{Input, ModelRepr, Provenance, Space, State, Structure};
+/// use firmware_core::model::{Symmetry, Target};
+///
+/// // A planar robot with 12 observables, each of them a term: two inputs at the present and the three
+/// // samples before, the changes of the pose before the present sample, and one of them before that.
+/// let state = |name, space| State {
+///     name, unit: "", space, target: Target::Increment, limit: [f32::MIN, f32::MAX],
+/// };
+/// let input = |name| Input { name, unit: "", range: [-1.0, 1.0] };
+/// let inputs = (0..8).map(|i| (Source::Input(i % 2), i / 2));
+/// let changes = [(0, 1), (1, 1), (2, 1), (2, 2)].map(|(i, lag)| (Source::Increment(i), lag));
+/// let observable = |(source, lag)| Observable { source, lag, centre: 0.0, gain: 1.0 };
+/// let structure = Structure::try_from(ModelRepr {
+///     robot: "planar",
+///     sample_time_s: 0.1,
+///     states: [state("x", Space::Line), state("y", Space::Line), state("phi", Space::Circle)]
+///         .into_iter().collect(),
+///     inputs: [input("v"), input("omega")].into_iter().collect(),
+///     symmetry: Symmetry::Se2 { x: 0, y: 1, heading: 2 },
+///     observables: inputs.chain(changes).map(observable).collect(),
+///     factors: (0..12).map(|observable| Factor { observable, basis: Basis::Hermite, order: 1 })
+///         .collect(),
+///     blocks: [Block { factors: 1, max_degree: 0 }; 12].into_iter().collect(),
+///     provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+/// }).unwrap();
+/// let terms: Vec<[u8; 2]> = (0..12).map(|function| [0, function]).collect();
+/// let terms = SparseTerms::new(structure.dictionary(), &terms).unwrap();
+/// assert_eq!(trainer::cost::instructions(&structure, Some(terms)), 875);
 /// ```
-pub fn cost(constants: &Constants, shape: Shape) -> Cost {
-    let times =
-        |count: usize, each: u32| u32::try_from(count).unwrap_or(u32::MAX).saturating_mul(each);
-    let instructions = [
-        constants.step,
-        times(shape.functions, constants.function),
-        times(shape.terms, constants.term),
-        times(shape.terms.saturating_mul(shape.outputs), constants.product),
-        times(shape.lagged, constants.lagged),
-        times(shape.angles, constants.angle),
-        if shape.se2 { constants.se2 } else { 0 },
-    ];
-    // Header, sections and provenance; names and limits; then coefficients, chain, ranges.
-    let bytes = 220
-        + times(shape.states + shape.inputs, 20)
-        + times(shape.observables, 11 + 8 + 5)
-        + times(shape.terms, 2)
-        + times((shape.terms + 1).saturating_mul(shape.outputs), 4);
-    Cost { instructions: instructions.into_iter().fold(0, u32::saturating_add), bytes }
+pub fn instructions(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> u32 {
+    let parts = parts(structure, terms);
+    parts.iter().map(|part| part.count as f32 * part.each).sum::<f32>().round() as u32
+}
+
+/// Something that a step does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Part {
+    /// What.
+    pub name: &'static str,
+    /// How often a model does it.
+    pub count: usize,
+    /// Instructions each time.
+    pub each: f32,
+}
+
+/// What a step does. Of a sparse model up to four outputs are summed while the terms are made, further
+/// ones two by two.
+pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part; 31] {
+    let part = |name, count, each| Part { name, count, each };
+    let (dense, outputs) = (terms.is_none(), structure.outputs());
+    let observables = structure.dictionary().observables();
+    let scaled = observables.iter().filter(|o| dense || (o.centre, o.gain) != (0.0, 1.0)).count();
+
+    // A sparse model has a factor per block, and no blocks for the kernel.
+    let factors = structure.dictionary().blocks().flat_map(|(_, factors)| factors);
+    let factors: Vec<&Factor> = factors.filter(|_| !dense).collect();
+    let beyond = |f: &&Factor| usize::from(f.order) - 1;
+    let of_basis = |basis| factors.iter().copied().filter(move |f| f.basis == basis);
+    let fourier = of_basis(Basis::Fourier).filter(|f| f.order > 1);
+    let powers = of_basis(Basis::Hermite).map(|f| beyond(&f)).sum();
+    let fourier_harmonics = fourier.clone().map(|f| beyond(&f)).sum();
+    let count = terms.map_or(0, |terms| terms.entries().len());
+    let made = [1, 2, 3, 4].map(|n| if outputs.min(4) == n { count } else { 0 });
+    let later = if dense { 0 } else { outputs.saturating_sub(4) };
+
+    let blocks = structure.dictionary().blocks().filter(|_| dense);
+    let blocks: Vec<(usize, usize)> =
+        blocks.map(|(_, own)| (own.len(), own.iter().map(|f| f.radix()).product())).collect();
+
+    let of =
+        |kind: &dyn Fn(&State<'_>) -> bool| structure.states().iter().filter(|s| kind(s)).count();
+    let absolute = |s: &State<'_>| (s.space, s.target) == (Space::Circle, Target::Absolute);
+    let observed = |source: Source| observables.iter().any(|o| o.source == source);
+    let heading =
+        |i: u8| matches!(structure.symmetry(), Symmetry::Se2 { heading, .. } if heading == i);
+    let states = (0_u8..).zip(structure.states());
+    let turned = states.clone().filter(|(i, s)| {
+        let needed = heading(*i) || observed(Source::Sin(*i)) || observed(Source::Cos(*i));
+        (s.space, s.target) == (Space::Circle, Target::Increment) && needed
+    });
+    let turned = turned.count();
+    let angles = states.filter(|(i, s)| {
+        let [low, high] = s.limit;
+        let limited = low > -std::f32::consts::PI || high < std::f32::consts::PI;
+        absolute(s) && (limited || observed(Source::Increment(*i)))
+    });
+    let angles = angles.count();
+    [
+        part("step", 1, 178.3),
+        part("step of a dense model", usize::from(dense), -103.3),
+        part("input", structure.inputs().len(), 11.4),
+        part("observable and its range", observables.len(), 13.7),
+        part("observable that is centred or scaled", scaled, 19.9),
+        part("source with a delay line", structure.delay_lines(), 6.7),
+        part("four numbers of the history moved on", structure.delayed() / 4, 12.9),
+        part("Fourier factor from order 2 on", fourier.count(), 14.5),
+        part("sine and cosine of a harmonic from the second on", fourier_harmonics, 17.9),
+        part("power from the second on", powers, 13.1),
+        part("term and its product with 1 output", made[0], 12.0),
+        part("term and its products with 2 outputs", made[1], 16.1),
+        part("term and its products with 3 outputs", made[2], 19.0),
+        part("term and its products with 4 outputs", made[3], 22.2),
+        part("more than 4 outputs", later.min(1), 39.1),
+        part("two further outputs", later / 2, 19.8),
+        part("term times two further outputs", later / 2 * count, 11.0),
+        part("last further output", later % 2, 14.5),
+        part("term times the last further output", later % 2 * count, 4.9),
+        part(
+            "coordinate on R, next value",
+            of(&|s| (s.space, s.target) == (Space::Line, Target::Absolute)),
+            43.3,
+        ),
+        part(
+            "coordinate on R, change",
+            of(&|s| (s.space, s.target) == (Space::Line, Target::Increment)),
+            44.9,
+        ),
+        part(
+            "angle, change",
+            of(&|s| (s.space, s.target) == (Space::Circle, Target::Increment)),
+            57.2,
+        ),
+        part("sine and cosine of an angle predicted by its change", turned, 53.2),
+        part("angle, next sine and cosine", of(&absolute), 92.8),
+        part("its limits or its observed change", angles, 155.6),
+        part(
+            "planar pose",
+            usize::from(matches!(structure.symmetry(), Symmetry::Se2 { .. })),
+            35.1,
+        ),
+        part("dense block", blocks.len(), 341.7),
+        part("factor of a dense block", blocks.iter().map(|(factors, _)| factors).sum(), 74.3),
+        part("dense block and output", blocks.len() * outputs, 23.3),
+        part(
+            "dense coefficient of the first 16 of a block",
+            blocks.iter().map(|(_, size)| size.min(&16) * outputs).sum(),
+            14.2,
+        ),
+        part("dense coefficient", blocks.iter().map(|(_, size)| size * outputs).sum(), 6.8),
+    ]
 }

@@ -7,14 +7,14 @@
 
 use std::collections::BTreeMap;
 
-use firmware_core::Number;
 use firmware_core::capacity::{MAX_BASIS, MAX_BLOCKS, MAX_INPUTS, MAX_OBSERVABLES, MAX_STATES};
 use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source, fourier};
 use firmware_core::model::{
     Input, ModelError, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
+use firmware_core::{Number, SparseTerms};
 
-use crate::cost::{CORTEX_M4F, Cost, Shape, cost};
+use crate::cost::Cost;
 use crate::robot::Robot;
 use crate::terms::Names;
 
@@ -554,26 +554,16 @@ impl Chain {
         }
     }
 
-    /// What it costs in this frame.
+    /// What it costs in this frame; [`Cost::REFUSED`] where the controller has no room for it.
     pub fn cost(&self, structure: &Structure<'_>) -> Cost {
-        let angle = |(i, s): (usize, &State<'_>)| {
-            let of = |o: &(Source, u8)| matches!(o.0, Source::Sin(j) | Source::Cos(j) if usize::from(j) == i);
-            s.target == Target::Increment
-                && s.space == Space::Circle
-                && self.observables.iter().any(of)
-        };
-        let shape = Shape {
-            states: structure.states().len(),
-            inputs: structure.inputs().len(),
-            outputs: structure.outputs(),
-            observables: self.observables.len(),
-            lagged: self.observables.iter().filter(|o| o.1 > 0).count(),
-            functions: self.functions,
-            terms: self.entries.len(),
-            angles: structure.states().iter().enumerate().filter(|s| angle(*s)).count(),
-            se2: matches!(structure.symmetry(), Symmetry::Se2 { .. }),
-        };
-        cost(&CORTEX_M4F, shape)
+        let byte = |index: usize| u8::try_from(index).ok();
+        let entries: Option<Vec<[u8; 2]>> =
+            self.entries.iter().map(|[p, f]| Some([byte(*p)?, byte(*f)?])).collect();
+        let Some(entries) = entries else { return Cost::REFUSED };
+        match SparseTerms::new(structure.dictionary(), &entries) {
+            Ok(terms) if structure.fits(Some(terms)).is_ok() => Cost::new(structure, Some(terms)),
+            _ => Cost::REFUSED,
+        }
     }
 }
 

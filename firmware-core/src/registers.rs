@@ -1,0 +1,337 @@
+//! The register file of a predictor: every number that a step reads or writes, and where it lies.
+//!
+//! A register has a byte as its index, and there are 256 of them, so that no access needs a check.
+//!
+//! | registers | what they hold |
+//! |---|---|
+//! | 0 | the constant 1 |
+//! | 1 | nothing |
+//! | 2 … | the inputs of the step to be predicted, in order |
+//! | then | the present sample, four per coordinate: itself, its change since the sample before, sine, cosine |
+//! | then | *delay lines*: what is observed of earlier samples, each source at consecutive samples, the newest first; padded to a multiple of four |
+//! | then | what a step computes: standardised observables, functions and terms ([`kernel`](crate::kernel)) |
+//!
+//! All delay lines move on by one sample when all their registers are moved up by one: the last of a
+//! line falls onto the head of the next line, which is then written anew, from the present sample or
+//! the inputs.
+
+use core::cell::Cell;
+
+use heapless::Vec;
+
+use crate::Scalar;
+use crate::capacity::{MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_STATES, REGISTERS};
+use crate::dictionary::{Observable, Source};
+use crate::model::{Space, State, Symmetry, Target};
+
+/// Register of the constant 1.
+pub(crate) const ONE: u8 = 0;
+/// Register that nothing uses.
+pub(crate) const NOWHERE: u8 = 1;
+/// Register of the first input.
+pub(crate) const INPUTS: u8 = 2;
+/// Registers of a coordinate in the present sample, and registers of the delay lines that are moved at
+/// once: what a Cortex-M loads and stores with one instruction each.
+pub(crate) const GROUP: usize = 4;
+/// Where they are among the four of a coordinate.
+pub(crate) const CHANGE: u8 = 1;
+pub(crate) const SIN: u8 = 2;
+pub(crate) const COS: u8 = 3;
+
+/// The registers.
+#[derive(Clone, Debug)]
+pub(crate) struct Registers<S>([S; REGISTERS]);
+
+impl<S: Scalar> Registers<S> {
+    pub(crate) fn new() -> Self {
+        let mut registers = Self([S::ZERO; REGISTERS]);
+        registers.set(ONE, S::ONE);
+        registers
+    }
+
+    #[inline(always)]
+    pub(crate) fn get(&self, register: u8) -> S {
+        // Never out of bounds: there are as many registers as bytes.
+        self.0.get(usize::from(register)).copied().unwrap_or_default()
+    }
+
+    #[inline(always)]
+    pub(crate) fn set(&mut self, register: u8, value: S) {
+        if let Some(to) = self.0.get_mut(usize::from(register)) {
+            *to = value;
+        }
+    }
+
+    /// `count` registers from `first` on, as far as there are.
+    #[inline(always)]
+    pub(crate) fn slice(&self, first: u8, count: usize) -> &[S] {
+        self.0.get(usize::from(first)..).and_then(|rest| rest.get(..count)).unwrap_or(&[])
+    }
+
+    /// The same, to be written.
+    #[inline(always)]
+    pub(crate) fn slice_mut(&mut self, first: u8, count: usize) -> &mut [S] {
+        let rest = self.0.get_mut(usize::from(first)..).unwrap_or_default();
+        rest.get_mut(..count).unwrap_or_default()
+    }
+
+    /// The registers, to be read and written in one loop.
+    #[inline(always)]
+    pub(crate) fn cells(&mut self) -> Cells<'_, S> {
+        Cells(Cell::from_mut(&mut self.0).as_array_of_cells())
+    }
+
+    /// The present sample.
+    #[inline(always)]
+    pub(crate) fn present(&self, layout: &Layout) -> &[[S; GROUP]] {
+        self.0.get(usize::from(layout.present)..).unwrap_or_default().as_chunks().0
+    }
+
+    /// Moves on by one sample: delay lines, and then the present sample.
+    #[inline(always)]
+    pub(crate) fn advance(&mut self, layout: &Layout, next: &[[S; GROUP]; MAX_STATES]) {
+        let lines = self.0.get_mut(usize::from(layout.lines)..).unwrap_or_default();
+        let (groups, _) = lines.as_chunks_mut::<GROUP>();
+        // The head of the first line is written anew, whatever comes in.
+        let mut carry = S::ZERO;
+        for group in groups.iter_mut().take(layout.groups.into()) {
+            let [a, b, c, d] = *group;
+            *group = [carry, a, b, c];
+            carry = d;
+        }
+        for [head, from] in &layout.heads {
+            self.set(*head, self.get(*from));
+        }
+        let present = self.0.get_mut(usize::from(layout.present)..).unwrap_or_default();
+        let (present, _) = present.as_chunks_mut::<GROUP>();
+        for ((to, from), _) in present.iter_mut().zip(next).zip(&layout.states) {
+            *to = *from;
+        }
+    }
+}
+
+/// All registers, each to be read and written.
+#[derive(Clone, Copy)]
+pub(crate) struct Cells<'r, S>(&'r [Cell<S>; REGISTERS]);
+
+impl<'r, S: Scalar> Cells<'r, S> {
+    #[inline(always)]
+    pub(crate) fn get(self, register: u8) -> S {
+        self.0.get(usize::from(register)).map_or(S::ZERO, Cell::get)
+    }
+
+    /// `count` registers from `first` on, as far as there are.
+    #[inline(always)]
+    pub(crate) fn slice(self, first: u8, count: usize) -> &'r [Cell<S>] {
+        self.0.get(usize::from(first)..).and_then(|rest| rest.get(..count)).unwrap_or(&[])
+    }
+}
+
+/// What the operator's outputs for a coordinate become.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// On ℝ, the next value.
+    #[default]
+    Line,
+    /// On ℝ, its change.
+    Increment,
+    /// On ℝ, its change, rotated with the pose.
+    Pose,
+    /// On S¹, its change.
+    AngleIncrement,
+    /// The same, with sine and cosine needed.
+    AngleIncrementTrigonometric,
+    /// On S¹, sine and cosine, from which nothing else is needed.
+    Circle,
+    /// The same, with limits or an observed change, which take the angle.
+    Angle,
+}
+
+impl Kind {
+    /// Whether the outputs are sine and cosine.
+    #[inline]
+    pub(crate) fn absolute_angle(self) -> bool {
+        matches!(self, Self::Circle | Self::Angle)
+    }
+}
+
+/// What becomes of a coordinate's outputs, and its limits.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Place {
+    pub(crate) kind: Kind,
+    /// Limits of the coordinate, finite: what is within them is finite.
+    pub(crate) limit: [f32; 2],
+}
+
+/// Where the pose of an se(2)-symmetric model is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Pose {
+    /// Coordinates.
+    pub(crate) x: u8,
+    pub(crate) y: u8,
+    /// Outputs.
+    pub(crate) ahead: u8,
+    pub(crate) left: u8,
+    /// Registers of the heading's sine and cosine.
+    pub(crate) sin: u8,
+    pub(crate) cos: u8,
+}
+
+/// Sources that may have a delay line.
+const LINES: usize = 4 * MAX_STATES + MAX_INPUTS;
+
+/// Where everything lies that a history keeps.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Layout {
+    /// Register of the raw value of every observable.
+    pub(crate) observables: Vec<u8, MAX_OBSERVABLES>,
+    pub(crate) states: Vec<Place, MAX_STATES>,
+    pub(crate) pose: Option<Pose>,
+    /// The first register of every delay line, and where its next value comes from.
+    pub(crate) heads: Vec<[u8; 2], LINES>,
+    /// Changes of coordinates are observed.
+    pub(crate) increments: bool,
+    inputs: u8,
+    /// The first register of the present sample.
+    pub(crate) present: u8,
+    /// The first register of the delay lines, and how many groups they are.
+    pub(crate) lines: u8,
+    pub(crate) groups: u8,
+    /// The first register behind the history.
+    pub(crate) end: u8,
+    /// Differs between layouts that keep different things, or keep them elsewhere.
+    pub(crate) id: u32,
+}
+
+/// Registers that a history needs at most: of an angle its sine, cosine and changes are delayed.
+const HISTORY: usize = INPUTS as usize
+    + MAX_INPUTS
+    + MAX_STATES * (GROUP + 2 * MAX_LAG + MAX_LAG - 1)
+    + MAX_INPUTS * MAX_LAG
+    + GROUP;
+const _: () = assert!(HISTORY < REGISTERS, "no index of a register that keeps something overflows");
+
+impl Layout {
+    /// Of a checked structure; `trigonometric` has a bit per coordinate whose sine and cosine are
+    /// needed.
+    pub(crate) fn new(
+        states: &[State<'_>],
+        inputs: usize,
+        symmetry: Symmetry,
+        observables: &[Observable],
+        trigonometric: impl Fn(usize) -> bool,
+    ) -> Self {
+        let observed = |source| observables.iter().any(|o| o.source == source);
+        let places = (0..).zip(states.iter().take(MAX_STATES)).map(|(i, state)| {
+            let [low, high] = state.limit;
+            let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
+            let kind = match (state.target, state.space) {
+                (Target::Absolute, Space::Line) => Kind::Line,
+                (Target::Increment, Space::Line) => match symmetry {
+                    Symmetry::Se2 { x, y, .. } if x == i || y == i => Kind::Pose,
+                    _ => Kind::Increment,
+                },
+                (Target::Absolute, Space::Circle) => {
+                    match limited || observed(Source::Increment(i)) {
+                        true => Kind::Angle,
+                        false => Kind::Circle,
+                    }
+                }
+                (Target::Increment, Space::Circle) => match trigonometric(i.into()) {
+                    true => Kind::AngleIncrementTrigonometric,
+                    false => Kind::AngleIncrement,
+                },
+            };
+            Place { kind, limit: [low.max(f32::MIN), high.min(f32::MAX)] }
+        });
+        let places: Vec<Place, MAX_STATES> = places.collect();
+        let present = INPUTS.saturating_add(inputs as u8);
+        let coordinate = |i: u8| present.saturating_add(i.saturating_mul(GROUP as u8));
+
+        // The register of a source at its latest sample, and the lag of that sample.
+        let latest = |source: Source| match source {
+            Source::State(i) => (coordinate(i), 0),
+            Source::Sin(i) => (coordinate(i).saturating_add(SIN), 0),
+            Source::Cos(i) => (coordinate(i).saturating_add(COS), 0),
+            Source::Increment(i) => (coordinate(i).saturating_add(CHANGE), 1),
+            Source::Input(i) => (INPUTS.saturating_add(i), 0),
+        };
+        let lines = coordinate(places.len() as u8);
+        let mut next = lines;
+        // The first register of the line of every source.
+        let mut heads: Vec<[u8; 2], LINES> = Vec::new();
+        let mut registers: Vec<u8, MAX_OBSERVABLES> = Vec::new();
+        for o in observables {
+            let (from, lag) = latest(o.source);
+            if o.lag <= lag {
+                let _ = registers.push(from);
+                continue;
+            }
+            let head = match heads.iter().find(|[_, source]| *source == from) {
+                Some([head, _]) => *head,
+                None => {
+                    let own = observables.iter().filter(|other| other.source == o.source);
+                    let oldest = own.map(|o| o.lag).max().unwrap_or(lag);
+                    let _ = heads.push([next, from]);
+                    let head = next;
+                    next = next.saturating_add(oldest.saturating_sub(lag));
+                    head
+                }
+            };
+            let _ =
+                registers.push(head.saturating_add(o.lag.saturating_sub(lag)).saturating_sub(1));
+        }
+        let groups = next.saturating_sub(lines).div_ceil(GROUP as u8);
+        let pose = match symmetry {
+            Symmetry::Se2 { x, y, heading } => {
+                // An absolute angle has two outputs.
+                let output = |coordinate: u8| {
+                    places.iter().take(coordinate.into()).fold(0_u8, |sum, place| {
+                        sum.saturating_add(1).saturating_add(place.kind.absolute_angle().into())
+                    })
+                };
+                let ((sin, _), (cos, _)) =
+                    (latest(Source::Sin(heading)), latest(Source::Cos(heading)));
+                Some(Pose { x, y, ahead: output(x), left: output(y), sin, cos })
+            }
+            _ => None,
+        };
+        let bytes = heads.iter().flatten().copied().chain([present, lines, groups]);
+        let trigonometric = (0..places.len()).map(|i| trigonometric(i).into());
+        // FNV-1a.
+        let id = bytes
+            .chain(trigonometric)
+            .fold(0x811C_9DC5, |id: u32, byte| (id ^ u32::from(byte)).wrapping_mul(0x0100_0193));
+        Self {
+            observables: registers,
+            states: places,
+            pose,
+            heads,
+            increments: (0..states.len() as u8).any(|i| observed(Source::Increment(i))),
+            inputs: inputs as u8,
+            present,
+            lines,
+            groups,
+            end: lines.saturating_add(groups.saturating_mul(GROUP as u8)),
+            id,
+        }
+    }
+
+    /// Inputs of the model.
+    #[inline]
+    pub(crate) fn inputs(&self) -> usize {
+        self.inputs.into()
+    }
+
+    /// What becomes of a coordinate that a checked structure has.
+    #[inline]
+    pub(crate) fn kind(&self, coordinate: u8) -> Kind {
+        self.states.get(usize::from(coordinate)).map(|place| place.kind).unwrap_or_default()
+    }
+
+    /// The registers that a history keeps: the first, and how many.
+    #[inline]
+    pub(crate) fn kept(&self) -> (u8, u8) {
+        (self.present, self.end.saturating_sub(self.present))
+    }
+}

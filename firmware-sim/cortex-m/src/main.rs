@@ -1,0 +1,149 @@
+//! firmware-core on a Cortex-M4F: loads blobs, checks them, and counts the instructions of a step.
+//!
+//! QEMU runs it (`cargo run --release`; `measure` in this folder does more). Under `-icount shift=0`
+//! every instruction takes one nanosecond of the machine's time, so that SysTick counts them; a loop
+//! of known length says how many a tick is. Counts are exact and repeatable; they are no cycles.
+//!
+//! Without an argument the blobs of `models/` are measured, which are part of the image. The
+//! semihosting argument names a file of other blobs, each behind its length (u32, little-endian).
+//! A line per blob comes out: its place, its robot, instructions of a step, bytes of the blob.
+#![no_std]
+#![no_main]
+
+use core::hint::black_box;
+
+use cortex_m::peripheral::SYST;
+use cortex_m::peripheral::syst::SystClkSource;
+use cortex_m_rt::entry;
+use cortex_m_semihosting::{debug, hprintln};
+use firmware_core::blob::{Aligned, parse, self_test};
+use firmware_core::{Model, Predictor, PredictorState};
+
+mod host;
+
+/// Repetitions that are counted together: a tick is then less than a hundredth of an instruction.
+const REPETITIONS: u32 = 1_000;
+/// Rounds of the loop that calibrates, of two instructions each.
+const CALIBRATION: u32 = 1_000_000;
+/// Room for the largest blob that is read from the host.
+const ROOM: usize = 48 * 1024;
+
+static MODELS: [&Aligned<[u8]>; 3] = [
+    &Aligned(*include_bytes!("../../../models/rosbot/model.bin")),
+    &Aligned(*include_bytes!("../../../models/soft-leg/model.bin")),
+    &Aligned(*include_bytes!("../../../models/two-link-arm/model.bin")),
+];
+
+#[entry]
+fn main() -> ! {
+    let ok = measure().is_some();
+    debug::exit(if ok { debug::EXIT_SUCCESS } else { debug::EXIT_FAILURE });
+    loop {
+        cortex_m::asm::wfi();
+    }
+}
+
+#[panic_handler]
+fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+    hprintln!("panic");
+    debug::exit(debug::EXIT_FAILURE);
+    loop {
+        cortex_m::asm::wfi();
+    }
+}
+
+fn measure() -> Option<()> {
+    let mut timer = cortex_m::Peripherals::take()?.SYST;
+    timer.set_clock_source(SystClkSource::Core);
+    timer.set_reload(0x00FF_FFFF);
+    timer.clear_current();
+    timer.enable_counter();
+    // `delay(n)` runs a loop of two instructions n + 1 times.
+    let ticks = count(|| cortex_m::asm::delay(CALIBRATION - 1));
+    let per_tick = 2.0 * CALIBRATION as f32 / ticks as f32;
+    hprintln!(
+        "# model {} B, state {} B, {} instructions per tick",
+        size_of::<Model<'_>>(),
+        size_of::<PredictorState>(),
+        per_tick
+    );
+    let mut name = [0; 256];
+    let Some(mut list) = host::list(&mut name).and_then(host::File::open) else {
+        for (i, blob) in MODELS.iter().enumerate() {
+            one(i, &blob.0, per_tick)?;
+        }
+        return Some(());
+    };
+    let mut blob = Aligned([0; ROOM]);
+    let mut length = [0; 4];
+    let mut i = 0;
+    while list.read(&mut length) == length.len() {
+        let blob = blob.0.get_mut(..u32::from_le_bytes(length) as usize)?;
+        if list.read(blob) < blob.len() {
+            return None;
+        }
+        one(i, blob, per_tick)?;
+        i += 1;
+    }
+    Some(())
+}
+
+/// Ticks that `work` takes; the timer counts down.
+fn count(work: impl FnOnce()) -> u32 {
+    let before = SYST::get_current();
+    work();
+    before.wrapping_sub(SYST::get_current()) & 0x00FF_FFFF
+}
+
+/// Measures a step from the samples of the blob's self-test.
+#[inline(never)]
+fn one(i: usize, blob: &[u8], per_tick: f32) -> Option<()> {
+    let model = match parse(blob) {
+        Ok(model) => model,
+        Err(error) => {
+            hprintln!("{} {:?}", i, error);
+            return None;
+        }
+    };
+    let test = self_test(blob).ok()?;
+    let structure = model.structure();
+    let predictor = Predictor::new(&model);
+    let mut start = PredictorState::new();
+    let mut inputs = test.inputs.chunks_exact(structure.inputs().len().max(1));
+    let mut input: &[f32] = &[];
+    for states in test.states.chunks_exact(structure.states().len()) {
+        predictor.observe(&mut start, input, states).ok()?;
+        input = inputs.next().unwrap_or(&[]);
+    }
+    let mut state = start.clone();
+    let repeat = |state: &mut PredictorState, work: fn(_, &mut _, _) -> bool| {
+        let mut good = true;
+        let ticks = count(|| {
+            for _ in 0..REPETITIONS {
+                state.clone_from(black_box(&start));
+                good &= work(&predictor, state, input);
+            }
+        });
+        (ticks, good)
+    };
+    let (with, good) = repeat(&mut state, black_box(step));
+    if !good || state.out_of_range().is_some() {
+        hprintln!("{} not in range", i);
+        return None;
+    }
+    let (without, _) = repeat(&mut state, black_box(nothing));
+    // What `nothing` costs itself (a move and a return) goes with the call of the step.
+    let instructions = (with - without) as f32 * per_tick / REPETITIONS as f32;
+    hprintln!("{} {} {:.1} {}", i, structure.robot(), instructions, blob.len());
+    Some(())
+}
+
+#[inline(never)]
+fn step(predictor: &Predictor<'_, '_>, state: &mut PredictorState, input: &[f32]) -> bool {
+    predictor.step(state, input).is_ok()
+}
+
+#[inline(never)]
+fn nothing(_: &Predictor<'_, '_>, _: &mut PredictorState, _: &[f32]) -> bool {
+    true
+}
