@@ -488,10 +488,11 @@ impl Chain {
         false
     }
 
-    /// `[parent, function]` of entries 1, 2, …, as the controller has them where it
-    /// [fits](Self::fits).
-    pub fn controller_entries(&self) -> Vec<[u8; 2]> {
-        self.entries.iter().map(|entry| entry.map(|i| u8::try_from(i).unwrap_or(0))).collect()
+    /// `[parent, function]` of entries 1, 2, …, as the controller has them; `None` where their numbers
+    /// do not fit a byte.
+    pub fn controller_entries(&self) -> Option<Vec<[u8; 2]>> {
+        let byte = |index: usize| u8::try_from(index).ok();
+        self.entries.iter().map(|[parent, f]| Some([byte(*parent)?, byte(*f)?])).collect()
     }
 
     /// The entry of every term.
@@ -556,10 +557,7 @@ impl Chain {
 
     /// What it costs in this frame; [`Cost::REFUSED`] where the controller has no room for it.
     pub fn cost(&self, structure: &Structure<'_>) -> Cost {
-        let byte = |index: usize| u8::try_from(index).ok();
-        let entries: Option<Vec<[u8; 2]>> =
-            self.entries.iter().map(|[p, f]| Some([byte(*p)?, byte(*f)?])).collect();
-        let Some(entries) = entries else { return Cost::REFUSED };
+        let Some(entries) = self.controller_entries() else { return Cost::REFUSED };
         match SparseTerms::new(structure.dictionary(), &entries) {
             Ok(terms) if structure.fits(Some(terms)).is_ok() => Cost::new(structure, Some(terms)),
             _ => Cost::REFUSED,

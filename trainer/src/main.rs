@@ -179,8 +179,9 @@ struct SelectArgs {
     /// Stop after this many candidates: the number that a report gives repeats its search exactly.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     max_candidates: Option<u32>,
-    /// Stop after this many seconds; where that is depends on the machine.
-    #[arg(long, value_name = "S", default_value_t = 120, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    /// Stop searching after this many seconds; where that is depends on the machine. Some models of
+    /// the front are refined after that.
+    #[arg(long, value_name = "S", default_value_t = 80, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     time_limit: u32,
     /// Threads; the result does not depend on them.
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=64))]

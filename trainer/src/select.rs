@@ -61,8 +61,9 @@ const RIDGE: f64 = 1e-6;
 const WIDTHS: [usize; 3] = [12, 40, 400];
 /// A frame whose error in the screening is this many times the best one's is not searched.
 const HOPELESS: f64 = 1.5;
-/// The winner's error is at most this fraction above the best one's.
-pub const TOLERANCE: f64 = 0.05;
+/// The winner's error is at most this fraction above the best one's: with few trajectories a standard
+/// error is itself uncertain, and can be a large part of the error.
+pub const TOLERANCE: f64 = 0.1;
 /// Differences in NRMSE below this are the rounding of f32.
 const ROUNDING: f64 = 1e-6;
 /// A gain below this fraction of the error is none.
@@ -79,7 +80,7 @@ pub struct Budget {
     pub terms: usize,
     /// Candidates evaluated, refinements not counted.
     pub candidates: usize,
-    /// Time; where it cuts depends on the machine, and [`Selection::searched`] says how far it came.
+    /// Time before the front is refined; where it cuts depends on the machine, and [`Selection::searched`] says how far it came.
     pub time: Duration,
 }
 
@@ -90,7 +91,7 @@ impl Default for Budget {
             bytes: u32::MAX,
             terms: 60,
             candidates: usize::MAX,
-            time: Duration::from_secs(120),
+            time: Duration::from_secs(80),
         }
     }
 }
@@ -166,8 +167,8 @@ pub struct Candidate {
     pub nrmse: f64,
     /// RMSE over all steps per state, in its unit; by what the search scores by, as `nrmse`.
     pub rmse: Vec<f64>,
-    /// NRMSE and RMSE per state with one fold left out at a time, over all windows, as `trainer fit`
-    /// scores; of the models of the front.
+    /// NRMSE and RMSE per state over all windows, as `trainer fit` scores, where a search looks at some
+    /// of them; of the models of the front.
     pub cross_validated: Option<(f64, Vec<f64>)>,
     /// Squared errors per unit (trajectory or block) and state.
     sums: Vec<Vec<f64>>,
@@ -176,7 +177,7 @@ pub struct Candidate {
 }
 
 impl Candidate {
-    /// NRMSE with one fold left out at a time where that is known, otherwise that of the search.
+    /// NRMSE over all windows where that is known, otherwise over those that the search looks at.
     pub fn error(&self) -> f64 {
         self.cross_validated.as_ref().map_or(self.nrmse, |e| e.0)
     }
@@ -207,8 +208,7 @@ pub struct Selection {
     pub front: Vec<usize>,
     /// The smallest NRMSE within the budget.
     pub best: usize,
-    /// The cheapest within one standard error of the best: that of their difference or of the best
-    /// itself, whichever is less, and no more than [`TOLERANCE`].
+    /// The cheapest within one standard error of the best, and within [`TOLERANCE`] of it.
     pub winner: usize,
     /// One standard error of the best one's NRMSE.
     pub standard_error: f64,
@@ -218,8 +218,6 @@ pub struct Selection {
     pub arx: (f64, usize),
     /// Windows, horizon, and units that the standard error is over.
     pub scored: (usize, usize, usize),
-    /// Folds that the search leaves out together, and all folds.
-    pub folds: (usize, usize),
     /// The budget.
     pub budget: Budget,
     /// Seconds that the search took, for the report.
@@ -368,7 +366,7 @@ impl<'s> Search<'s> {
                 let i = next.fetch_add(1, Ordering::Relaxed);
                 match (new.get(i), known.get(i)) {
                     (Some(set), Some(None)) => {
-                        done.push((i, evaluate(problems, set, None, this.data.search())))
+                        done.push((i, evaluate(problems, set, None, &this.data.searched)))
                     }
                     (Some(_), _) => {}
                     _ => return done,
@@ -438,7 +436,7 @@ impl<'s> Search<'s> {
                         (&self.problems, self.data),
                         &set,
                         self.refinement(refine),
-                        self.data.search(),
+                        &self.data.searched,
                     )
                 });
                 self.take(set.clone(), refine, (&key, is_new), &outcome);
@@ -480,9 +478,10 @@ impl<'s> Search<'s> {
     fn cost(&self, frame: usize, terms: &[usize]) -> (Cost, bool) {
         let problem = &self.problems[frame];
         let chain = problem.chain(terms);
-        let Ok(structure) = chain.structure(&problem.repr) else { return (Cost::default(), false) };
+        let Ok(structure) = chain.structure(&problem.repr) else { return (Cost::REFUSED, false) };
         let (cost, budget) = (chain.cost(&structure), &self.options.budget);
-        let fits = cost.instructions <= budget.instructions
+        let fits = cost != Cost::REFUSED
+            && cost.instructions <= budget.instructions
             && cost.bytes <= budget.bytes
             && chain.len() - 1 <= budget.terms
             && chain.fits();
@@ -663,13 +662,13 @@ impl<'s> Search<'s> {
     fn thresholded(&self, frame: usize, ridge: f64) -> Vec<Vec<usize>> {
         let problem = &self.problems[frame];
         let mut kept: Vec<usize> = (0..problem.terms.len()).collect();
-        let (all, _) = problem.sums(&kept, &[]);
+        let (all, _) = problem.sums(&kept, None);
         let (width, m) = (1 + kept.len() + problem.outputs, problem.outputs);
         let rms = |column: usize| all[column * width + column].sqrt();
         let mut sets = Vec::new();
         for threshold in [1e-3, 3e-3, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.3] {
             for _ in 0..10 {
-                let Some(matrix) = problem.fit(&kept, ridge, &[]) else { return sets };
+                let Some(matrix) = problem.fit(&kept, ridge, None) else { return sets };
                 let share = |k: usize, t: usize| {
                     let of = |o: usize| {
                         (matrix[(k + 1) * m + o] * rms(t + 1)).abs() / rms(width - m + o)
@@ -904,11 +903,10 @@ pub fn select<T: Trajectories>(
         }
     };
     if let Some((front, ..)) = &chosen {
-        let single: Vec<Vec<usize>> = (0..data.plan.folds()).map(|fold| vec![fold]).collect();
         for i in front {
             let refinement = search.refinement(candidates[*i].refine);
             let problems = (&search.problems[..], &data);
-            let sums = evaluate(problems, &search.models[*i], refinement, (&single, &data.all));
+            let sums = evaluate(problems, &search.models[*i], refinement, &data.all);
             candidates[*i].cross_validated = sums.ok().map(|sums| {
                 let (rmse, nrmse) = data.errors(&data.all, &sums, None);
                 (nrmse, rmse)
@@ -928,7 +926,6 @@ pub fn select<T: Trajectories>(
         states: robot.states.iter().map(|s| (s.name.clone(), s.unit.clone())).collect(),
         trajectories: names,
         scored: (data.all.windows.len(), data.horizon, data.all.steps.len()),
-        folds: (data.splits.first().map_or(0, Vec::len), data.plan.folds()),
         budget: options.budget,
         seconds: 0.0,
         held_out: Vec::new(),
@@ -956,13 +953,10 @@ pub fn select<T: Trajectories>(
 fn choose(candidates: &[Candidate], data: &Data) -> Option<(Vec<usize>, usize, usize, f64)> {
     let front = pareto(candidates);
     let best = *front.last()?;
-    let error = |i: usize, u| data.errors(&data.searched, &candidates[i].sums, u).1;
-    let standard_error = data.jackknife(|u| error(best, u));
-    // The same trajectories score both, so the error of their difference counts. But a loss in one
-    // trajectory alone looks like one standard error, however large it is: hence the other two.
+    let standard_error =
+        data.jackknife(|u| data.errors(&data.searched, &candidates[best].sums, u).1);
     let most = standard_error.min(TOLERANCE * candidates[best].nrmse);
-    let within = |i: usize| data.jackknife(|u| error(i, u) - error(best, u)).min(most);
-    let winner = one_standard_error(candidates, &front, within)?;
+    let winner = one_standard_error(candidates, &front, most)?;
     Some((front, best, winner, standard_error))
 }
 
@@ -985,15 +979,11 @@ fn pareto(candidates: &[Candidate]) -> Vec<usize> {
     order
 }
 
-/// The cheapest of the front (sorted by cost, then terms; the best one last) whose error is within
-/// one standard error, of its difference to the best, of the best.
-fn one_standard_error(
-    candidates: &[Candidate],
-    front: &[usize],
-    error: impl Fn(usize) -> f64,
-) -> Option<usize> {
+/// The cheapest of the front (sorted by cost, then terms; the best one last) whose error is at most so
+/// much above that of the best.
+fn one_standard_error(candidates: &[Candidate], front: &[usize], most: f64) -> Option<usize> {
     let best = candidates[*front.last()?].nrmse;
-    front.iter().copied().find(|i| candidates[*i].nrmse <= best + error(*i).max(ROUNDING))
+    front.iter().copied().find(|i| candidates[*i].nrmse <= best + most.max(ROUNDING))
 }
 
 /// NRMSE of no motion, and of the best ARX and its lags, on the same windows.
@@ -1069,14 +1059,14 @@ impl Selection {
         let problem = Problem::new(robot, &self.frames[candidate.frame], terms, data)?;
         let chain = problem.chain(&all);
         let refinement = candidate.refine.map(|kappa| Refinement { data, kappa, threads: 1 });
-        let model = problem.coefficients(&chain, &all, candidate.ridge, &[], refinement)?;
+        let model = problem.coefficients(&chain, &all, candidate.ridge, None, refinement)?;
         let test = Data::new(robot, test, options, Windows::Tested { first });
         // What the test itself does is no divergence.
         let both =
             data.range.iter().zip(&test.range).map(|(a, b)| [a[0].min(b[0]), a[1].max(b[1])]);
         let range: Vec<[f64; 2]> = both.collect();
         let sums =
-            roll_out((&test, &test.all), &problem, &chain, Some(vec![(&[][..], model)]), &range)
+            roll_out((&test, &test.all), &problem, &chain, Some(vec![(None, model)]), &range)
                 .ok()?;
         let (rmse, nrmse) = test.errors(&test.all, &sums, None);
         (!test.all.windows.is_empty()).then_some(Tested { rmse, nrmse })
@@ -1236,10 +1226,10 @@ mod tests {
         table.push(dear);
         let front = pareto(&table);
         assert_eq!(front, [4, 2, 1, 0]);
-        assert_eq!(one_standard_error(&table, &front, |_| 0.015), Some(1));
-        assert_eq!(one_standard_error(&table, &front, |_| 0.035), Some(2));
-        assert_eq!(one_standard_error(&table, &front, |_| 0.0), Some(0));
-        assert_eq!(one_standard_error(&table, &[], |_| 0.0), None);
+        assert_eq!(one_standard_error(&table, &front, 0.015), Some(1));
+        assert_eq!(one_standard_error(&table, &front, 0.035), Some(2));
+        assert_eq!(one_standard_error(&table, &front, 0.0), Some(0));
+        assert_eq!(one_standard_error(&table, &[], 0.0), None);
     }
 
     #[test]
@@ -1258,7 +1248,7 @@ mod tests {
                 (&data, &data.all),
                 &problem,
                 &chain,
-                Some(vec![(&[][..], vec![0.0, gain])]),
+                Some(vec![(None, vec![0.0, gain])]),
                 &data.range,
             )
         };

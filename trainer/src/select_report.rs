@@ -8,7 +8,7 @@ use crate::cost::Cost;
 use crate::plot::{self, Axes, Chart, Series, Style};
 use crate::report::{grouped, significant};
 use crate::select::Selection;
-use crate::sparse_fit::{MARGIN, Rejection};
+use crate::sparse_fit::{MARGIN, Rejection, SEARCH_WINDOWS};
 
 impl Selection {
     /// What was found, as text.
@@ -19,14 +19,12 @@ impl Selection {
         let mut text = format!(
             "{}: {} candidates and {} refinements of the front in {:.0} s, {} of them rejected; {windows} windows of {horizon} steps, \
              cross-validated over {units} trajectories or blocks.\n\
-             Searched by leaving {} of {} folds out together; `NRMSE` leaves out one, as `trainer fit` does.\n",
+             `search` is the NRMSE over the windows that the search looks at, at most about {SEARCH_WINDOWS}.\n",
             self.robot,
             grouped(self.searched as u64),
             self.candidates.len() - self.searched,
             self.seconds,
             grouped(rejected.len() as u64),
-            self.folds.0,
-            self.folds.1,
         );
         text += &format!(
             "NRMSE of no motion {}, of the linear ARX with {} lags {}.\n\n",
@@ -132,6 +130,7 @@ impl Selection {
             (f64::from(c.cost.instructions), c.error())
         };
         let all: Vec<usize> = (0..self.candidates.len())
+            .filter(|i| self.candidates[*i].cost != Cost::REFUSED)
             .filter(|i| self.candidates[*i].nrmse <= 2.0 * self.no_motion.max(self.arx.0))
             .collect();
         let (low, high) = all
@@ -152,7 +151,7 @@ impl Selection {
             axes: Axes::LogY,
             series: vec![
                 series(
-                    "evaluated, several folds left out",
+                    "evaluated",
                     [200, 200, 200],
                     Style::Points,
                     all.iter().map(point).collect(),

@@ -91,7 +91,7 @@ impl WindowSet {
 }
 
 /// Windows that a search looks at: those of a long log overlap, and say the same again.
-const SEARCH_WINDOWS: usize = 400;
+pub(crate) const SEARCH_WINDOWS: usize = 400;
 
 /// What data serve for.
 #[derive(Clone, Copy, Debug)]
@@ -119,8 +119,6 @@ pub(crate) struct Data {
     pub(crate) deviation: Vec<f64>,
     pub(crate) range: Vec<[f64; 2]>,
     pub(crate) horizon: usize,
-    /// The folds that are left out together, of every model that scores a candidate.
-    pub(crate) splits: Vec<Vec<usize>>,
     pub(crate) hash: [u8; 32],
 }
 
@@ -196,7 +194,6 @@ impl Data {
             n,
             m,
             spaces,
-            splits: splits(plan.folds()),
             plan,
             trials,
             searched: all.thinned(SEARCH_WINDOWS, horizon),
@@ -208,18 +205,12 @@ impl Data {
         }
     }
 
-    /// What a search scores by: the splits and the windows.
-    pub(crate) fn search(&self) -> (&[Vec<usize>], &WindowSet) {
-        (&self.splits, &self.searched)
-    }
-
-    /// What a refinement looks at: the windows that train a model that leaves some folds out, thinned
-    /// out, with so many samples before the present one.
-    fn training_windows(&self, lag: usize, out: &[usize]) -> Vec<refine::Window<'_>> {
+    /// What a refinement looks at: the windows that train a fold, or all, thinned out, with so many
+    /// samples before the present one.
+    fn training_windows(&self, lag: usize, fold: Option<usize>) -> Vec<refine::Window<'_>> {
         let trains = |w: &&Window| {
-            let rows = || (w.row - lag..=w.row + self.horizon).map(|row| row as u64);
-            let all = |f| rows().all(|row| self.plan.trains(f, Role::Fold(w.fold), row));
-            out.iter().all(|f| all(*f))
+            let mut rows = (w.row - lag..=w.row + self.horizon).map(|row| row as u64);
+            fold.is_none_or(|f| rows.all(|row| self.plan.trains(f, Role::Fold(w.fold), row)))
         };
         let all: Vec<&Window> = self.all.windows.iter().filter(trains).collect();
         let rows = |w: &&Window| {
@@ -266,15 +257,6 @@ impl Data {
         let squares: f64 = left_out.iter().map(|x| (x - mean) * (x - mean)).sum();
         (squares * (units - 1) as f64 / units as f64).sqrt()
     }
-}
-
-/// The splits of so many folds that the search scores by: half of the folds but one, every other one
-/// of them, are left out together, once from every fold on. A model that holds with little data and in
-/// many ways of leaving data out is more likely to hold elsewhere than one that was chosen by leaving
-/// out a single trajectory at a time (Shao 1993, "Linear model selection by cross-validation").
-pub(crate) fn splits(folds: usize) -> Vec<Vec<usize>> {
-    let out = (folds.saturating_sub(1) / 2).max(1);
-    (0..folds).map(|first| (0..out).map(|k| (first + 2 * k) % folds).collect()).collect()
 }
 
 /// Sums over the pairs that train the same folds and have as many earlier samples.
@@ -371,9 +353,9 @@ impl<'r> Problem<'r> {
         Some(problem)
     }
 
-    /// The sums of some terms (the constant first) and the targets over the pairs that train a model
-    /// that leaves some folds out: shape `[columns, columns]`, and the number of pairs.
-    pub(crate) fn sums(&self, terms: &[usize], out: &[usize]) -> (Vec<f64>, u64) {
+    /// The sums of some terms (the constant first) and the targets over the pairs that train a fold,
+    /// or all: shape `[columns, columns]`, and the number of pairs.
+    pub(crate) fn sums(&self, terms: &[usize], fold: Option<usize>) -> (Vec<f64>, u64) {
         let lag = terms.iter().map(|t| self.terms[*t].lag()).max().unwrap_or(0);
         let all = 1 + self.terms.len() + self.outputs;
         let columns: Vec<usize> = std::iter::once(0)
@@ -383,7 +365,7 @@ impl<'r> Problem<'r> {
         let n = columns.len();
         let (mut sums, mut pairs) = (vec![0.0; n * n], 0);
         for group in &self.groups {
-            if group.earlier < lag || out.iter().any(|f| !group.trains[*f]) {
+            if group.earlier < lag || fold.is_some_and(|f| !group.trains[f]) {
                 continue;
             }
             pairs += group.pairs;
@@ -411,13 +393,13 @@ impl<'r> Problem<'r> {
         chain: &Chain,
         terms: &[usize],
         ridge: f64,
-        out: &[usize],
+        fold: Option<usize>,
         refinement: Option<Refinement<'_>>,
     ) -> Option<Vec<f32>> {
-        let mut fitted = self.fit(terms, ridge, out)?;
+        let mut fitted = self.fit(terms, ridge, fold)?;
         if let Some(Refinement { data, kappa, threads }) = refinement {
             let structure = chain.structure(&self.repr).ok()?;
-            let (m, len, entries) = (self.outputs, chain.len(), chain.controller_entries());
+            let (m, len, entries) = (self.outputs, chain.len(), chain.controller_entries()?);
             let expand = |matrix: &[f64]| {
                 let mut coefficients = vec![0.0; len * m];
                 let places = std::iter::once(&0).chain(chain.place());
@@ -428,7 +410,7 @@ impl<'r> Problem<'r> {
             };
             let entries = Some(&entries[..]);
             let shape = refine::Shape { structure: &structure, entries, expand: &expand };
-            let windows = data.training_windows(structure.lag(), out);
+            let windows = data.training_windows(structure.lag(), fold);
             refine::refine(shape, &mut fitted, &windows, kappa, threads);
         }
         let mut coefficients = vec![0.0; chain.len() * self.outputs];
@@ -444,7 +426,7 @@ impl<'r> Problem<'r> {
     /// How much more of what is left of the targets would be left without each of the terms, summed
     /// over the targets.
     pub(crate) fn losses(&self, terms: &[usize], ridge: f64) -> Vec<f64> {
-        let (mut sums, _) = self.sums(terms, &[]);
+        let (mut sums, _) = self.sums(terms, None);
         let (n, m) = (terms.len() + 1, self.outputs);
         let width = n + m;
         let norm: Vec<f64> =
@@ -478,9 +460,9 @@ impl<'r> Problem<'r> {
         (1..n).map(|i| (0..m).map(|o| loss(i, o)).sum()).collect()
     }
 
-    /// Coefficients, shape `[terms + 1, outputs]`, without some folds.
-    pub(crate) fn fit(&self, terms: &[usize], ridge: f64, out: &[usize]) -> Option<Vec<f64>> {
-        let (sums, pairs) = self.sums(terms, out);
+    /// Coefficients, shape `[terms + 1, outputs]`, of the pairs that train a fold, or all.
+    pub(crate) fn fit(&self, terms: &[usize], ridge: f64, fold: Option<usize>) -> Option<Vec<f64>> {
+        let (sums, pairs) = self.sums(terms, fold);
         let (n, m) = (terms.len() + 1, self.outputs);
         let rows = || sums.chunks_exact(n + m).take(n);
         let equations = NormalEquations {
@@ -528,7 +510,7 @@ impl Residual {
     /// Of the whole library, the constant explained away.
     pub(crate) fn new(problem: &Problem<'_>) -> Self {
         let all: Vec<usize> = (0..problem.terms.len()).collect();
-        let (mut sums, _) = problem.sums(&all, &[]);
+        let (mut sums, _) = problem.sums(&all, None);
         let (n, m) = (all.len() + 1, problem.outputs);
         let width = n + m;
         let norm: Vec<f64> =
@@ -607,21 +589,23 @@ pub(crate) struct Refinement<'d> {
     pub(crate) threads: usize,
 }
 
-/// A model and the folds that were left out of its fit; none for one fitted on everything.
-pub(crate) type Without<'s> = (&'s [usize], Vec<f32>);
+/// A model and the fold whose windows it is rolled out over; `None` for all windows.
+pub(crate) type Without = (Option<usize>, Vec<f32>);
 
-/// Fits a candidate without the folds of every split and rolls it out over the windows of these.
+/// Fits a candidate without any one fold and rolls it out over the windows of that fold.
 pub(crate) fn evaluate(
     (problems, data): (&[Problem<'_>], &Data),
     (frame, terms, ridge): &Model,
     refinement: Option<Refinement<'_>>,
-    (splits, set): (&[Vec<usize>], &WindowSet),
+    set: &WindowSet,
 ) -> Outcome {
     let problem = &problems[*frame];
     let chain = problem.chain(terms);
     let ridge = f64::from_bits(*ridge);
-    let fit = |out: &Vec<usize>| problem.coefficients(&chain, terms, ridge, out, refinement);
-    let models: Option<Vec<_>> = splits.iter().map(|out| Some((&out[..], fit(out)?))).collect();
+    let fit = |fold| {
+        Some((Some(fold), problem.coefficients(&chain, terms, ridge, Some(fold), refinement)?))
+    };
+    let models: Option<Vec<_>> = (0..data.plan.folds()).map(fit).collect();
     roll_out((data, set), problem, &chain, models, &data.range)
 }
 
@@ -636,18 +620,18 @@ pub(crate) fn stress(
     let chain = problem.chain(terms);
     (0..data.plan.folds()).find_map(|fold| {
         let ridge = f64::from_bits(*ridge);
-        let model = problem.coefficients(&chain, terms, ridge, &[fold], refinement);
-        let everywhere = model.map(|m| vec![(&[][..], m)]);
+        let model = problem.coefficients(&chain, terms, ridge, Some(fold), refinement);
+        let everywhere = model.map(|m| vec![(None, m)]);
         roll_out((data, &data.all), problem, &chain, everywhere, &data.range).err()
     })
 }
 
-/// Rolls models out over all windows of the folds that they leave out, or of all: mean squared sums.
+/// Rolls models out over their windows.
 pub(crate) fn roll_out(
     (data, set): (&Data, &WindowSet),
     problem: &Problem<'_>,
     chain: &Chain,
-    models: Option<Vec<Without<'_>>>,
+    models: Option<Vec<Without>>,
     range: &[[f64; 2]],
 ) -> Outcome {
     let unfit = Rejection { windows: 0, trajectory: 0, row: 0, step: 0, state: None };
@@ -658,11 +642,9 @@ pub(crate) fn roll_out(
     let mut sums = vec![vec![0.0; data.n]; set.steps.len()];
     let mut rejection: Option<Rejection> = None;
     for window in &set.windows {
-        let scored = |(out, _): &&Without<'_>| out.is_empty() || out.contains(&window.fold);
-        let share = 1.0 / models.iter().filter(scored).count().max(1) as f64;
-        for (_, model) in models.iter().filter(scored) {
-            let to = &mut sums[window.unit];
-            if let Err((step, state)) = rollout.run(data, window, model, share, to) {
+        let own = models.iter().filter(|(fold, _)| fold.is_none_or(|f| f == window.fold));
+        for (_, model) in own {
+            if let Err((step, state)) = rollout.run(data, window, model, &mut sums[window.unit]) {
                 let Window { trajectory, row, .. } = *window;
                 let first = Rejection { windows: 0, trajectory, row, step, state };
                 rejection.get_or_insert(first).windows += 1;
@@ -707,13 +689,12 @@ impl<'r, 'a> Rollout<'r, 'a> {
         }
     }
 
-    /// Adds a share of the squared errors of a window; the step and state where it fails otherwise.
+    /// Adds the squared errors of a window; the step and state where it fails otherwise.
     pub(crate) fn run(
         &mut self,
         data: &Data,
         window: &Window,
         coefficients: &[f32],
-        share: f64,
         sums: &mut [f64],
     ) -> Result<(), (usize, Option<usize>)> {
         let (n, m) = (data.n, data.m);
@@ -752,7 +733,7 @@ impl<'r, 'a> Rollout<'r, 'a> {
                     Space::Line => f64::from(*p) - x,
                     Space::Circle => (f64::from(*p) - x).wrap(),
                 };
-                sums[i] += share * error * error;
+                sums[i] += error * error;
             }
         }
         Ok(())
