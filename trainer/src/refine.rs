@@ -408,6 +408,8 @@ impl Collected {
             kept: Self { states: structure.states().len(), windows: Vec::new() },
         };
         source.visit(&mut reader)?;
+        // The trajectories are counted from the first one again.
+        reader.rows = Rows::new(plan, structure);
         reader.every = Some(reader.found.iter().map(|count| thinning(*count)).collect());
         reader.found.fill(0);
         source.visit(&mut reader)?;
@@ -589,7 +591,9 @@ mod tests {
     #[test]
     fn a_fold_is_refined_on_the_windows_of_the_others_alone() {
         let robot = robot("refine = 0.1");
+        // Their number is no multiple of that of the folds.
         let mut trajectories = measured(0.3);
+        trajectories.pop();
         let fit = |t: &[Trajectory]| {
             let source = InMemory { trajectories: t, states: 1, inputs: 1 };
             let fit = edmd::fit(&robot, &source, &|_| {}).unwrap();
