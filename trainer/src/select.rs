@@ -47,10 +47,13 @@ use crate::trajectory::{InMemory, Trajectories, Trajectory};
 
 /// Frames that are searched after the screening.
 pub const FRAMES: usize = 2;
-/// Ridges tried, on columns of unit norm.
-pub const RIDGES: [f64; 7] = [1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2];
+/// Ridges tried, on columns of unit norm; the smallest are for logs without noise.
+pub const RIDGES: [f64; 9] = [1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2];
 /// Models of the front that are refined.
 const REFINED: usize = 8;
+/// Coefficients of a model that is refined: the time for it grows with their square, and larger models
+/// gain little.
+const REFINED_COEFFICIENTS: usize = 240;
 /// How firmly the one-step fit holds a refinement, as far as each is better than the one before.
 pub const KAPPAS: [f64; 3] = [1.0, 0.1, 0.01];
 /// A refinement that gains less than this fraction of the error is not worth having.
@@ -421,7 +424,11 @@ impl<'s> Search<'s> {
 
     /// Refines models evenly spread over the front, the best among them.
     fn refine_front(&mut self) {
-        let front = pareto(&self.candidates);
+        let mut front = pareto(&self.candidates);
+        front.retain(|i| {
+            let (frame, terms, _) = &self.models[*i];
+            (terms.len() + 1) * self.problems[*frame].outputs <= REFINED_COEFFICIENTS
+        });
         let count = front.len().min(REFINED);
         for i in (1..=count).map(|i| front[i * front.len() / count - 1]) {
             let set = self.models[i].clone();
