@@ -34,7 +34,6 @@ use sha2::{Digest, Sha256};
 use crate::arx::MAX_LAGS;
 use crate::cost::Cost;
 use crate::library::{Chain, Frame, Term, library};
-use crate::recording::Visitor;
 use crate::report::hexadecimal;
 use crate::robot::{FitOptions, Robot, ScoreOptions};
 use crate::score::{self, Counts, Lifted, ScoreError};
@@ -43,7 +42,7 @@ use crate::sparse_fit::{
 };
 pub use crate::sparse_fit::{MARGIN, Rejection};
 use crate::terms::{Names, robot_names};
-use crate::trajectory::{InMemory, Trajectories, Trajectory};
+use crate::trajectory::{InMemory, Trajectories, Trajectory, collect_named};
 
 /// Frames that are searched after the screening.
 pub const FRAMES: usize = 2;
@@ -816,28 +815,9 @@ fn collect<T: Trajectories>(
     source: &T,
     wanted: &dyn Fn(&str) -> bool,
 ) -> Result<Vec<(String, Trajectory)>, T::Error> {
-    struct Collector<'w> {
-        wanted: &'w dyn Fn(&str) -> bool,
-        taken: bool,
-        trajectories: Vec<(String, Trajectory)>,
-    }
-    impl Visitor for Collector<'_> {
-        fn begin(&mut self, name: &str) {
-            self.taken = (self.wanted)(name);
-            if self.taken {
-                self.trajectories.push((name.to_owned(), Trajectory::default()));
-            }
-        }
-        fn row(&mut self, states: &[f64], inputs: &[f64]) {
-            if let (true, Some((_, last))) = (self.taken, self.trajectories.last_mut()) {
-                last.states.extend_from_slice(states);
-                last.inputs.extend_from_slice(inputs);
-            }
-        }
-    }
-    let mut all = Collector { wanted, taken: false, trajectories: Vec::new() };
-    source.visit(&mut all)?;
-    Ok(all.trajectories)
+    let mut trajectories = collect_named(source)?;
+    trajectories.retain(|(name, _)| wanted(name));
+    Ok(trajectories)
 }
 
 /// Searches the best sparse model of a robot; its own dictionary and fit are not looked at.

@@ -75,11 +75,10 @@ pub(crate) struct WindowSet {
 }
 
 impl WindowSet {
-    /// At most so many of them, evenly spread.
+    /// About so many of them, evenly spread over every unit, which keeps one at least.
     fn thinned(&self, most: usize, horizon: usize) -> Self {
         let every = self.windows.len().div_ceil(most).max(1);
         let mut thinned = Self { windows: Vec::new(), steps: vec![0.0; self.steps.len()] };
-        // Every unit keeps some.
         for own in self.windows.chunk_by(|a, b| a.unit == b.unit) {
             for window in own.iter().step_by(every) {
                 thinned.windows.push(*window);
