@@ -11,7 +11,7 @@
 use firmware_core::Scalar;
 use firmware_core::blob::{self, EmitError, SelfTest};
 use firmware_core::error_bounds::ErrorBounds;
-use firmware_core::model::{Model, Space};
+use firmware_core::model::{Model, Space, Structure};
 use serde::Serialize;
 
 use crate::arx::MAX_LAGS;
@@ -106,44 +106,66 @@ impl Residuals {
         horizon: usize,
         least: usize,
     ) -> Result<Self, ConformalError> {
-        let structure = model.structure();
-        let (n, m) = (structure.states().len(), structure.inputs().len());
-        let first = structure.lag().max(MAX_LAGS);
+        let n = model.structure().states().len();
+        let (unit, long) = Self::units_of(model.structure(), trajectories, horizon, least)?;
+        let mut residuals = Self { unit, states: n, horizon, errors: Vec::new(), diverged: 0 };
+        for t in long {
+            residuals.add(model, t);
+        }
+        Ok(residuals)
+    }
+
+    /// Samples before the first step that is predicted: the same for every model of a few lags.
+    fn before(structure: &Structure<'_>) -> usize {
+        structure.lag().max(MAX_LAGS)
+    }
+
+    /// What the units are, and the trajectories that are long enough for one.
+    pub(crate) fn units_of<'t>(
+        structure: &Structure<'_>,
+        trajectories: &'t [Trajectory],
+        horizon: usize,
+        least: usize,
+    ) -> Result<(Unit, Vec<&'t Trajectory>), ConformalError> {
+        let first = Self::before(structure);
         let need = first + 1 + horizon;
-        let rows = |t: &Trajectory| t.states.len() / n.max(1);
+        let rows = |t: &Trajectory| t.states.len() / structure.states().len().max(1);
         let long: Vec<&Trajectory> = trajectories.iter().filter(|t| rows(t) >= need).collect();
         if long.is_empty() {
             return Err(ConformalError::NoWindow { need, first });
         }
-        let unit = if long.len() >= least { Unit::Trajectory } else { Unit::Block };
-        let mut residuals = Self { unit, states: n, horizon, errors: Vec::new(), diverged: 0 };
-        let mut predicted = vec![0.0; horizon * n];
-        for t in long {
-            let starts = match unit {
-                Unit::Trajectory => 1,
-                Unit::Block => rows(t) / need,
-            };
-            for start in (0..starts).map(|block| block * need) {
-                let row = |k: usize| [&t.states[k * n..][..n], &t.inputs[k * m..][..m]].concat();
-                let window: Vec<Vec<f64>> = (start..start + need).map(row).collect();
-                let (past, future) = window.split_at(first + 1);
-                if !roll_out_model(model, past, future, &mut predicted) {
-                    residuals.diverged += 1;
-                    residuals.errors.extend(std::iter::repeat_n(f64::INFINITY, horizon * n));
-                    continue;
-                }
-                for (p, x) in predicted.chunks_exact(n).zip(future) {
-                    for (i, state) in structure.states().iter().enumerate() {
-                        let error = match state.space {
-                            Space::Line => p[i] - x[i],
-                            Space::Circle => (p[i] - x[i]).wrap(),
-                        };
-                        residuals.errors.push(error.abs());
-                    }
+        Ok((if long.len() >= least { Unit::Trajectory } else { Unit::Block }, long))
+    }
+
+    /// The units of one more trajectory, which is long enough.
+    pub(crate) fn add(&mut self, model: &Model<'_>, t: &Trajectory) {
+        let (structure, n) = (model.structure(), self.states);
+        let (m, first) = (structure.inputs().len(), Self::before(structure));
+        let need = first + 1 + self.horizon;
+        let mut predicted = vec![0.0; self.horizon * n];
+        let starts = match self.unit {
+            Unit::Trajectory => 1,
+            Unit::Block => t.states.len() / n.max(1) / need,
+        };
+        for start in (0..starts).map(|block| block * need) {
+            let row = |k: usize| [&t.states[k * n..][..n], &t.inputs[k * m..][..m]].concat();
+            let window: Vec<Vec<f64>> = (start..start + need).map(row).collect();
+            let (past, future) = window.split_at(first + 1);
+            if !roll_out_model(model, past, future, &mut predicted) {
+                self.diverged += 1;
+                self.errors.extend(std::iter::repeat_n(f64::INFINITY, predicted.len()));
+                continue;
+            }
+            for (p, x) in predicted.chunks_exact(n).zip(future) {
+                for (i, state) in structure.states().iter().enumerate() {
+                    let error = match state.space {
+                        Space::Line => p[i] - x[i],
+                        Space::Circle => (p[i] - x[i]).wrap(),
+                    };
+                    self.errors.push(error.abs());
                 }
             }
         }
-        Ok(residuals)
     }
 
     /// Number of units.
@@ -350,19 +372,26 @@ const USUAL: f64 = 0.95;
 impl CoverageReport {
     /// `None` when no step has a bound.
     pub fn new(residuals: &Residuals, bounds: ErrorBounds<'_>, names: &[&str]) -> Option<Self> {
-        let cells: Vec<(usize, f64)> = residuals
-            .coverage(bounds)
-            .into_iter()
-            .enumerate()
-            .filter_map(|(cell, share)| Some((cell, share?)))
-            .collect();
         let nominal = f64::from(bounds.coverage());
+        Self::of(nominal, bounds.units(), residuals, &residuals.coverage(bounds), names)
+    }
+
+    /// The same of the shares of units within bounds that were made elsewhere, shape `[horizon, states]`.
+    pub(crate) fn of(
+        nominal: f64,
+        calibration_units: u32,
+        residuals: &Residuals,
+        shares: &[Option<f64>],
+        names: &[&str],
+    ) -> Option<Self> {
+        let cells = shares.iter().enumerate().filter_map(|(cell, share)| Some((cell, (*share)?)));
+        let cells: Vec<(usize, f64)> = cells.collect();
         let off = |share: f64| (share - nominal).abs();
         let (cell, worst) = cells.iter().copied().max_by(|a, b| off(a.1).total_cmp(&off(b.1)))?;
         let shares = cells.iter().map(|c| c.1);
         Some(Self {
             nominal,
-            calibration_units: bounds.units(),
+            calibration_units,
             unit: residuals.unit,
             units: residuals.units(),
             cells: cells.len(),
@@ -377,7 +406,7 @@ impl CoverageReport {
             // Blocks of one trajectory depend on each other: no theory says how far apart they lie.
             chance: (residuals.unit == Unit::Trajectory)
                 .then(|| {
-                    let calibration = bounds.units() as usize;
+                    let calibration = calibration_units as usize;
                     chance_range(calibration, residuals.units(), nominal, USUAL)
                 })
                 .flatten(),

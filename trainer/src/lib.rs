@@ -11,7 +11,7 @@
 //! | [`score`], [`arx`], [`unicycle`] | rollouts over windows beside no motion, a linear ARX and a unicycle |
 //! | [`rollout`] | rollouts in f64 or f32, and their errors over test logs |
 //! | [`select`], [`library`], [`cost`] | the search for the best rollout that fits a controller |
-//! | [`conformal`] | error bounds per state and step from held-out logs |
+//! | [`conformal`], [`cross_conformal`] | error bounds per state and step from held-out logs, or by leaving logs out |
 //! | [`stability`] | the model linearised along the data; where rollouts leave the data |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
 //! | [`forecast`], [`koopman`], [`hermite`], [`edmd_dl`], [`sindy`] | one interface for every method, the methods |
@@ -25,6 +25,7 @@ pub mod chain;
 pub mod conformal;
 pub mod convergence;
 pub mod cost;
+pub mod cross_conformal;
 pub mod edmd;
 pub mod edmd_dl;
 pub mod export;

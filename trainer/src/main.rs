@@ -11,12 +11,13 @@ use firmware_core::model::{Model, Space, Structure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use trainer::conformal::{CoverageReport, Residuals, Unit, least_units, with_bounds};
+use trainer::cross_conformal::CrossResiduals;
 use trainer::edmd;
 use trainer::export::{controller_coefficients, export, write_whole};
 use trainer::figures;
 use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
-use trainer::recording::{LogColumn, LogSchema, Recording};
+use trainer::recording::{LogColumn, LogSchema, Recording, Visitor};
 use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
 use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
@@ -27,7 +28,7 @@ use trainer::select::{self, Budget};
 use trainer::spectrum_report::SpectrumReport;
 use trainer::stability::Stability;
 use trainer::topology::{Orders, lifting};
-use trainer::trajectory::{Logs, collect, collect_named};
+use trainer::trajectory::{Logs, Trajectories, collect, collect_named};
 
 /// Fits Koopman models to robot logs and writes them as blobs that a microcontroller reads.
 #[derive(Parser)]
@@ -108,6 +109,10 @@ struct EvaluateArgs {
 
 /// Measure how far off a blob's rollouts are on logs that it was not fitted on, and store bounds for
 /// every state and step in it (split-conformal prediction).
+///
+/// Where there are no logs to spare, --cross-validate takes those of the fit: the model is fitted anew
+/// without each fold of trajectories, and the errors are those on the fold that was left out
+/// (cross-conformal prediction).
 #[derive(Args)]
 struct CalibrateArgs {
     /// The blob.
@@ -115,6 +120,9 @@ struct CalibrateArgs {
     /// Folder of CSV logs that the model has not seen, or one CSV file.
     #[arg(long, value_name = "DIR")]
     logs: PathBuf,
+    /// The logs are those of the fit: leave out fold by fold, as in robot.toml.
+    #[arg(long)]
+    cross_validate: bool,
     /// Share of predictions that the bounds shall hold for.
     #[arg(long, value_name = "P", default_value_t = 0.9)]
     coverage: f64,
@@ -573,9 +581,13 @@ impl BlobFile {
     fn read(path: &Path) -> Result<Self, Failure> {
         let bytes =
             std::fs::read(path).map_err(|e| format!("{}: cannot be read: {e}", path.display()))?;
+        Ok(Self::aligned(&bytes))
+    }
+
+    fn aligned(bytes: &[u8]) -> Self {
         let mut words = vec![0_u32; bytes.len().div_ceil(4)];
-        bytemuck::cast_slice_mut(&mut words)[..bytes.len()].copy_from_slice(&bytes);
-        Ok(Self { words, length: bytes.len() })
+        bytemuck::cast_slice_mut(&mut words)[..bytes.len()].copy_from_slice(bytes);
+        Self { words, length: bytes.len() }
     }
 
     fn bytes(&self) -> &[u8] {
@@ -628,11 +640,11 @@ fn log_schema(
     (path, robot): (&Path, Option<&PathBuf>),
     (horizon, stride): (Option<u32>, Option<u32>),
     model: &Model<'_>,
-) -> Result<(LogSchema, ScoreOptions), Failure> {
+) -> Result<(LogSchema, ScoreOptions, Option<Robot>), Failure> {
     let structure = model.structure();
     let beside = path.parent().unwrap_or(Path::new("")).join("robot.toml");
     let description = robot.cloned().or_else(|| beside.is_file().then_some(beside));
-    let (schema, mut options) = match description {
+    let (schema, mut options, robot) = match description {
         Some(description) => {
             let robot = Robot::load(&description)?;
             let states = robot.states.iter().map(|s| (s.name.as_str(), s.unit.as_str(), s.space));
@@ -651,7 +663,7 @@ fn log_schema(
                     robot.name
                 )));
             }
-            (robot.schema, robot.score)
+            (robot.schema.clone(), robot.score.clone(), Some(robot))
         }
         None => {
             let states = structure.states().iter().map(|s| LogColumn::new(s.name, s.unit));
@@ -659,7 +671,8 @@ fn log_schema(
             // The decimal number that was meant: 0.1, not 0.10000000149.
             let dt = structure.sample_time_s();
             let dt = dt.to_string().parse().unwrap_or(f64::from(dt));
-            (LogSchema::new(dt, states.collect(), inputs.collect()), ScoreOptions::default())
+            let schema = LogSchema::new(dt, states.collect(), inputs.collect());
+            (schema, ScoreOptions::default(), None)
         }
     };
     options.hold_out.clear();
@@ -669,7 +682,7 @@ fn log_schema(
     if let Some(stride) = stride {
         options.stride = stride as usize;
     }
-    Ok((schema, options))
+    Ok((schema, options, robot))
 }
 
 /// `evaluate --json`.
@@ -689,7 +702,7 @@ fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     let file = BlobFile::read(&args.model)?;
     let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
     let place = (args.model.as_path(), args.robot.as_ref());
-    let (schema, options) = log_schema(place, (args.horizon, args.stride), &model)?;
+    let (schema, options, _) = log_schema(place, (args.horizon, args.stride), &model)?;
     let recording = Recording::open(&args.logs)?;
     let source = Logs { recording: &recording, schema: &schema };
     if let Some(path) = &args.csv
@@ -789,11 +802,53 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
     let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
     let test = blob::self_test(file.bytes()).map_err(|e| refused(&args.model, e))?;
     let place = (args.model.as_path(), args.robot.as_ref());
-    let (schema, options) = log_schema(place, (args.horizon, None), &model)?;
+    let (schema, options, described) = log_schema(place, (args.horizon, None), &model)?;
     let least = least_units(args.coverage)?;
     let recording = Recording::open(&args.logs)?;
-    let trajectories = collect(&Logs { recording: &recording, schema: &schema })?;
-    let residuals = Residuals::measure(&model, &trajectories, options.horizon, least)?;
+    let source = Logs { recording: &recording, schema: &schema };
+    let seen = source.visit(&mut Unread)?.sha256 == model.structure().provenance().logs;
+    let trajectories = collect(&source)?;
+    let (residuals, covered) = match (args.cross_validate, seen) {
+        (false, false) => {
+            (Residuals::measure(&model, &trajectories, options.horizon, least)?, None)
+        }
+        (true, true) => {
+            let robot = described.filter(|r| r.sha256 == model.structure().provenance().robot);
+            let robot = robot.ok_or_else(|| {
+                "--cross-validate needs the robot.toml of the fit, unchanged: give it with --robot, \
+                 or fit again"
+                    .to_owned()
+            })?;
+            let bar = ProgressBar::new(robot.score.folds as u64);
+            if let Ok(style) = ProgressStyle::with_template("fold {pos}/{len} {wide_bar} {elapsed}")
+            {
+                bar.set_style(style);
+            }
+            bar.enable_steady_tick(std::time::Duration::from_millis(200));
+            let cross =
+                CrossResiduals::measure(&robot, &trajectories, options.horizon, least, &|fold| {
+                    bar.set_position(fold as u64)
+                });
+            bar.finish_and_clear();
+            let cross = cross?;
+            let names: Vec<&str> = labels(model.structure()).into_iter().map(|l| l.0).collect();
+            (cross.pooled(None), Some(cross.coverage(args.coverage, &names)))
+        }
+        (false, true) => {
+            return Err(Failure(format!(
+                "{}: the model was fitted on these very logs, on which it errs less than on others; \
+                 give logs that it has not seen, or add --cross-validate",
+                args.logs.display()
+            )));
+        }
+        (true, false) => {
+            return Err(Failure(format!(
+                "{}: --cross-validate leaves out parts of the logs that the model was fitted on, and \
+                 these are others; give those, or leave it out",
+                args.logs.display()
+            )));
+        }
+    };
     let bounds = residuals.bounds(args.coverage)?;
     let states: Vec<(String, String)> = labels(model.structure())
         .into_iter()
@@ -827,7 +882,25 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
             at(last)
         );
     }
+    match covered {
+        Some(Ok(Some(report))) => {
+            text += "Cross-validated: each fold asked with the bounds from the others.\n";
+            text += &report.text();
+        }
+        Some(Err(error)) => {
+            text += &format!("Whether the bounds hold cannot be asked fold by fold: {error}\n");
+        }
+        Some(Ok(None)) | None => {}
+    }
     print(&text)
+}
+
+/// Reads logs for their checksum alone.
+struct Unread;
+
+impl Visitor for Unread {
+    fn begin(&mut self, _: &str) {}
+    fn row(&mut self, _: &[f64], _: &[f64]) {}
 }
 
 /// `stability --json`.
@@ -846,7 +919,7 @@ fn stability(args: &StabilityArgs) -> Result<(), Failure> {
     let file = BlobFile::read(&args.model)?;
     let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
     let place = (args.model.as_path(), args.robot.as_ref());
-    let (schema, options) = log_schema(place, (args.horizon, args.stride), &model)?;
+    let (schema, options, _) = log_schema(place, (args.horizon, args.stride), &model)?;
     let recording = Recording::open(&args.logs)?;
     let logs = collect_named(&Logs { recording: &recording, schema: &schema })?;
     let report = StabilityReport {
@@ -1177,9 +1250,15 @@ fn select_model(args: &SelectArgs) -> Result<(), Failure> {
     write_whole(&description, |file| file.write_all(text.as_bytes()))?;
     write_whole(&out.join("model.bin"), |file| file.write_all(&bytes))?;
     write_whole(&out.join("front.svg"), |file| file.write_all(found.figure().as_bytes()))?;
+    let file = BlobFile::aligned(&bytes);
+    let model =
+        firmware_core::parse(file.bytes()).map_err(|e| refused(&out.join("model.bin"), e))?;
+    let stability = Stability::measure(&model, &collect_named(&source)?, &robot.score)?;
     print(&format!(
-        "{}\n{}: {} bytes, fitted on all trajectories\n`trainer fit {} --logs {}` scores it\n",
+        "{}\n\nThe winner, fitted on all trajectories, along them:\n{}\n{}: {} bytes\n\
+         `trainer fit {} --logs {}` scores it\n",
         found.report().trim_end(),
+        stability.text(),
         out.join("model.bin").display(),
         grouped(bytes.len() as u64),
         out.display(),

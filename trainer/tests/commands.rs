@@ -645,7 +645,7 @@ fn a_refined_fit_says_so_and_repeats_to_the_bit() {
 fn calibrate_stores_bounds_that_evaluate_checks() {
     let workshop = Workshop::new();
     workshop.describe("[score]", "[dictionary]\norders = { phi = 0 }\n\n[score]");
-    workshop.succeed(&["fit", "."]);
+    workshop.succeed(&["fit", ".", "--no-score", "--logs", "logs/run-0.csv"]);
     let plain = workshop.read("model.bin");
     // Three trajectories are too few for 90 %; their 21 blocks of 16 rows are not.
     let said =
@@ -685,6 +685,33 @@ fn calibrate_stores_bounds_that_evaluate_checks() {
         let message = workshop.refuse(&command);
         assert!(message.contains(fragment), "{message}");
     }
+}
+
+#[test]
+fn calibrate_leaves_out_folds_of_the_logs_of_the_fit() {
+    let workshop = Workshop::new();
+    workshop.succeed(&["fit", "."]);
+    let same = ["calibrate", "model.bin", "--logs", "logs"];
+    let message = workshop.refuse(&same);
+    assert!(message.contains("fitted on these very logs"), "{message}");
+    let said = workshop.succeed(&[&same[..], &["--cross-validate"]].concat());
+    assert!(said.contains("error bounds for 90 % from 21 contiguous blocks"), "{said}");
+    // Three folds of seven blocks: each is asked with the bounds from fourteen.
+    assert!(said.contains("each fold asked with the bounds from the others"), "{said}");
+    assert!(said.contains("from 14 units: on 21 contiguous blocks"), "{said}");
+    // With 15 blocks at most, no fold has a finite bound for 94 %; all 21 have.
+    let high = [&same[..], &["--cross-validate", "--coverage", "0.94"]].concat();
+    let said = workshop.succeed(&high);
+    assert!(said.contains("cannot be asked fold by fold: 14 units"), "{said}");
+
+    let text = workshop.read("robot.toml");
+    workshop.write("robot.toml", [&text[..], b"# changed\n"].concat());
+    let message = workshop.refuse(&[&same[..], &["--cross-validate"]].concat());
+    assert!(message.contains("the robot.toml of the fit, unchanged"), "{message}");
+    workshop.write("robot.toml", &text);
+    workshop.succeed(&["fit", ".", "--no-score", "--logs", "logs/run-0.csv"]);
+    let message = workshop.refuse(&[&same[..], &["--cross-validate"]].concat());
+    assert!(message.contains("these are others"), "{message}");
 }
 
 #[test]
