@@ -35,6 +35,7 @@
 //! | [`blob`] | the bytes of a model: layout, parse, emit |
 //! | [`predictor`] | `Predictor` (immutable) and `PredictorState`: step, rollout, held inputs |
 //! | `registers`, `kernel` (private) | where the numbers of a step lie, and how it computes them |
+//! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
 //! | [`device`] | encoders, position sensors and the clock, as traits |
 //! | [`capacity`] | what there is room for |
 #![no_std]
@@ -54,6 +55,7 @@ compile_error!("blobs are little-endian and are read in place");
 
 pub mod blob;
 pub mod capacity;
+pub mod control_loop;
 pub mod device;
 pub mod dictionary;
 pub mod error_bounds;

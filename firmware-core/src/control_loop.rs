@@ -1,0 +1,148 @@
+//! Control loops: sense, predict, act, once per tick.
+//!
+//! ```text
+//!            commands ──┐                                   ┌──> telemetry
+//!  sensors ──> [Tracker: step, compare, look ahead] ──> [Supervisor: Idle, Running, Safe] ──> actuators
+//! ```
+//!
+//! | module | what lives there |
+//! |---|---|
+//! | [`supervisor`] | the state machine, its alarms, the command watchdog, deadlines |
+//! | [`tracker`] | the model beside the robot: predicted against measured, and the path ahead |
+//! | [`monitor`] | whether what is measured is what the model says, by its own error bounds |
+//! | [`telemetry`] | frames, and the queue that never blocks a loop |
+//! | [`soft_leg`] | a leg with two valves and two pumps |
+//! | [`rosbot`] | a robot with two driven sides |
+//!
+//! A loop does a bounded amount of work per tick, never waits, and takes time as an argument:
+//!
+//! ```text
+//! loop { wait for the timer; let start = clock.now_us(); robot.tick(start); robot.finish(clock.now_us()); }
+//! ```
+//!
+//! In [`Mode::Safe`](supervisor::Mode::Safe) and [`Mode::Idle`](supervisor::Mode::Idle) every tick
+//! switches the actuators off anew.
+
+pub mod monitor;
+pub mod rosbot;
+pub mod soft_leg;
+pub mod supervisor;
+pub mod telemetry;
+pub mod tracker;
+
+pub use rosbot::Rosbot;
+pub use soft_leg::SoftLeg;
+pub use supervisor::{Alarms, Mode};
+pub use telemetry::Frame;
+pub use tracker::Tracker;
+
+/// What the host asks for; `M` inputs in the model's order and units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Command<const M: usize> {
+    /// Idle → Running. Refused without a measurement.
+    Start,
+    /// The inputs from the next tick on; each is held within the range of the model. Only a running
+    /// robot follows them. They also say that the host is alive.
+    Inputs([f32; M]),
+    /// → Idle.
+    Stop,
+    /// Safe → Idle, alarms forgotten.
+    Reset,
+}
+
+/// Everything that moves the robot.
+///
+/// An implementation that cannot say whether it succeeded does both: it tries everything, and returns
+/// the error.
+pub trait Actuators<const M: usize> {
+    /// Applies inputs, each in −1 to 1 of what the actuator can do.
+    ///
+    /// # Errors
+    /// When some device cannot be set: the loop goes to Safe.
+    fn apply(&mut self, shares: [f32; M]) -> Result<(), ActuatorError>;
+
+    /// Switches everything off.
+    ///
+    /// # Errors
+    /// When some device cannot be set; the others are off.
+    fn stop(&mut self) -> Result<(), ActuatorError>;
+}
+
+/// A device could not be set.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ActuatorError;
+
+/// Why there is no control loop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ControlLoopError {
+    /// The model is one of another robot.
+    DimensionMismatch {
+        /// Of what.
+        field: &'static str,
+        /// What the loop has.
+        expected: usize,
+        /// What the model has.
+        found: usize,
+    },
+    /// A setting makes no sense.
+    Setting {
+        /// Which.
+        field: &'static str,
+    },
+}
+
+/// A duty of `share`, 0 to 1, of the most.
+pub(crate) fn set_share(
+    pwm: &mut impl embedded_hal::pwm::SetDutyCycle,
+    share: f32,
+) -> Result<(), ActuatorError> {
+    // Casts to integers saturate, and NaN gives 0.
+    let duty = (share.clamp(0.0, 1.0) * f32::from(pwm.max_duty_cycle()) + 0.5) as u16;
+    pwm.set_duty_cycle(duty.min(pwm.max_duty_cycle())).map_err(|_| ActuatorError)
+}
+
+/// Follows a command; `sees`: the last sample had a measurement.
+pub(crate) fn follow<const M: usize>(
+    command: Command<M>,
+    supervisor: &mut supervisor::Supervisor,
+    wanted: &mut [f32; M],
+    model: &crate::Model<'_>,
+    sees: bool,
+) {
+    match command {
+        Command::Start if sees => {
+            if supervisor.mode() == Mode::Idle {
+                *wanted = [0.0; M];
+            }
+            supervisor.start();
+        }
+        Command::Start => {}
+        Command::Inputs(inputs) if inputs.iter().all(|u| u.is_finite()) => {
+            let ranges = model.structure().inputs().iter().map(|input| input.range);
+            for ((to, u), [low, high]) in wanted.iter_mut().zip(inputs).zip(ranges) {
+                // Written so that no range, however strange, makes it panic.
+                *to = u.max(low).min(high);
+            }
+            supervisor.heard();
+        }
+        Command::Inputs(_) => supervisor.raise(Alarms::BAD_COMMAND),
+        Command::Stop => supervisor.stop(),
+        Command::Reset => supervisor.reset(),
+    }
+}
+
+/// Takes what was noticed at a sample. The model is one of a robot that runs: of one whose actuators are
+/// off only the sensor is judged.
+pub(crate) fn take<const N: usize, const M: usize, const H: usize>(
+    tracked: &tracker::Tracked<N>,
+    supervisor: &mut supervisor::Supervisor,
+    tracker: &mut Tracker<'_, '_, N, M, H>,
+) {
+    if supervisor.mode() == Mode::Running {
+        supervisor.raise(tracked.alarms);
+    } else {
+        supervisor.raise(tracked.alarms & Alarms::AT_REST);
+        tracker.forget_residuals();
+    }
+}

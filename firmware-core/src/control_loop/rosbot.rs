@@ -1,0 +1,401 @@
+//! The loop of a robot with two driven sides, such as the ROSbot: two motors with PWM and a direction pin,
+//! an encoder on each side, and a pose that is measured now and then.
+//!
+//! Every tick (10 ms) each side's speed controller reads its encoder and sets its motor. Every
+//! `ticks_per_sample` ticks (100 ms) is a sample of the model, whose inputs are the mean commanded wheel
+//! speeds since the sample before: the pose is predicted from them, corrected where it is measured, and
+//! predicted over the horizon.
+//!
+//! Speed controller, per side (as in the robot's own firmware, a PI):
+//!
+//! ```text
+//! ω̂ = 2π/N (n_k − n_{k−1}) / T                 N counts per turn of the wheel, T the tick
+//! e = ω_commanded − ω̂
+//! U = min(max(k_p e + I, −U_s), U_s),  I ← I + k_i e T   unless that drives U further into ±U_s
+//! ```
+
+use embedded_hal::digital::OutputPin;
+use embedded_hal::pwm::SetDutyCycle;
+
+use crate::control_loop::soft_leg::period_us;
+use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
+use crate::control_loop::telemetry::{Frame, Telemetry};
+use crate::control_loop::tracker::{Measurement, Tracker};
+use crate::control_loop::{ActuatorError, Actuators, Command, ControlLoopError, set_share};
+use crate::device::{EncoderCount, PositionSensor};
+use crate::model::Model;
+
+/// A motor behind an H-bridge.
+#[derive(Debug)]
+pub struct Motor<P, D> {
+    /// The duty is the size of the voltage as a share of the supply.
+    pub pwm: P,
+    /// High: forwards.
+    pub forwards: D,
+    /// Which way the pin says, once it is known.
+    direction: Option<bool>,
+}
+
+impl<P: SetDutyCycle, D: OutputPin> Motor<P, D> {
+    /// A motor whose pin has not been set yet.
+    pub fn new(pwm: P, forwards: D) -> Self {
+        Self { pwm, forwards, direction: None }
+    }
+
+    fn apply(&mut self, share: f32) -> Result<(), ActuatorError> {
+        let forwards = share > 0.0;
+        if share != 0.0 && self.direction != Some(forwards) {
+            // A bridge that is turned round under load short-circuits the motor's own voltage.
+            self.direction = None;
+            set_share(&mut self.pwm, 0.0)?;
+            self.forwards.set_state(forwards.into()).map_err(|_| ActuatorError)?;
+            self.direction = Some(forwards);
+        }
+        set_share(&mut self.pwm, share.abs())
+    }
+}
+
+/// The two sides of a robot, each with the motors of its wheels on one bridge.
+#[derive(Debug)]
+pub struct Sides<PR, DR, PL, DL> {
+    /// Right.
+    pub right: Motor<PR, DR>,
+    /// Left.
+    pub left: Motor<PL, DL>,
+}
+
+impl<PR, DR, PL, DL> Actuators<2> for Sides<PR, DR, PL, DL>
+where
+    PR: SetDutyCycle,
+    DR: OutputPin,
+    PL: SetDutyCycle,
+    DL: OutputPin,
+{
+    fn apply(&mut self, [right, left]: [f32; 2]) -> Result<(), ActuatorError> {
+        let (right, left) = (self.right.apply(right), self.left.apply(left));
+        right.and(left)
+    }
+
+    fn stop(&mut self) -> Result<(), ActuatorError> {
+        self.apply([0.0; 2])
+    }
+}
+
+/// The counters of the right and the left side.
+pub trait Encoders {
+    /// Both counts; `None` when one cannot be read.
+    fn counts(&mut self) -> Option<[u16; 2]>;
+}
+
+impl<R: EncoderCount, L: EncoderCount> Encoders for (R, L) {
+    fn counts(&mut self) -> Option<[u16; 2]> {
+        Some([self.0.count().ok()?, self.1.count().ok()?])
+    }
+}
+
+/// What fixes the loop of a ROSbot.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RosbotSettings {
+    /// Ticks per sample of the model.
+    pub ticks_per_sample: u8,
+    /// Encoder counts N per turn of a wheel.
+    pub counts_per_turn: f32,
+    /// Supply voltage U_s (V).
+    pub supply_volt: f32,
+    /// Proportional gain k_p of the speed controllers (V s/rad).
+    pub proportional_gain: f32,
+    /// Integral gain k_i of the speed controllers (V/rad).
+    pub integral_gain: f32,
+    /// No wheel turns faster (rad/s): a count that says so is not believed.
+    pub fastest_radps: f32,
+    /// A wheel that is this much slower or faster than commanded, on average over about a second, is an
+    /// alarm (rad/s).
+    pub wheel_tolerance_radps: f32,
+    /// A running robot stops after this time without a command (µs).
+    pub watchdog_us: u32,
+    /// Samples in a row without a measured pose after which it stops, or fewer where the model's error
+    /// bounds do not reach so far.
+    pub blind_samples: u32,
+}
+
+impl Default for RosbotSettings {
+    /// A ROSbot 2.0: 10 ticks of 10 ms per sample, 12 V motors geared down 34 : 1 with 48 counts per turn,
+    /// one second without a command or a pose.
+    fn default() -> Self {
+        Self {
+            ticks_per_sample: 10,
+            counts_per_turn: 1632.0,
+            supply_volt: 12.0,
+            proportional_gain: 0.7,
+            integral_gain: 9.0,
+            fastest_radps: 60.0,
+            wheel_tolerance_radps: 2.5,
+            watchdog_us: 1_000_000,
+            blind_samples: 10,
+        }
+    }
+}
+
+/// Ticks in a row that an encoder may be unreadable or implausible.
+const BAD_COUNTS: u8 = 5;
+/// Share of the newest sample in the mean deviation of a wheel's speed: about ten samples.
+const WHEEL_SHARE: f32 = 0.1;
+
+/// One side's speed controller.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Side {
+    /// Count at the last tick.
+    count: u16,
+    /// Speed as counted (rad/s).
+    speed: f32,
+    /// Integral part (V).
+    integral: f32,
+    /// Counted minus commanded speed, summed over the ticks of this sample (rad/s).
+    deviation: f32,
+    /// Its mean over samples.
+    mean_deviation: f32,
+}
+
+impl Side {
+    /// The voltage for a commanded speed.
+    fn control(&mut self, command: f32, settings: &RosbotSettings, period_s: f32) -> f32 {
+        let RosbotSettings { supply_volt, proportional_gain, integral_gain, .. } = *settings;
+        let error = command - self.speed;
+        let wanted = proportional_gain * error + self.integral;
+        let volt = wanted.max(-supply_volt).min(supply_volt);
+        let winds_up = volt != wanted && error * wanted > 0.0;
+        if !winds_up {
+            self.integral += integral_gain * error * period_s;
+        }
+        volt
+    }
+}
+
+/// The loop. `A` drives the sides, `E` counts their wheels, `S` sees the pose, `H` samples are looked
+/// ahead.
+pub struct Rosbot<'m, 'a, 'q, A, E, S, const H: usize> {
+    actuators: A,
+    encoders: E,
+    sensor: S,
+    settings: RosbotSettings,
+    period_s: f32,
+    tracker: Tracker<'m, 'a, 3, 2, H>,
+    supervisor: Supervisor,
+    telemetry: Telemetry<'q>,
+    /// What the host wants (rad/s), right and left.
+    wanted: [f32; 2],
+    /// What is commanded since the last tick.
+    applied: [f32; 2],
+    /// Sum of it over the ticks since the last sample, and their number.
+    sum: [f32; 2],
+    ticks: u8,
+    sides: [Side; 2],
+    /// Whether there is a count to compare the next one with.
+    counted: bool,
+    bad_counts: u8,
+}
+
+impl<'m, 'a, 'q, A, E, S, const H: usize> Rosbot<'m, 'a, 'q, A, E, S, H>
+where
+    A: Actuators<2>,
+    E: Encoders,
+    S: PositionSensor<3>,
+{
+    /// A robot that is idle; the model's sample time is `ticks_per_sample` periods of its ticks.
+    ///
+    /// # Errors
+    /// [`ControlLoopError`]: the model is not one of three states and two inputs, or a setting is out of
+    /// range.
+    pub fn new(
+        model: &'m Model<'a>,
+        (actuators, encoders, sensor): (A, E, S),
+        settings: RosbotSettings,
+        telemetry: Telemetry<'q>,
+    ) -> Result<Self, ControlLoopError> {
+        let tracker = Tracker::new(model, settings.blind_samples)?;
+        if settings.ticks_per_sample == 0 {
+            return Err(ControlLoopError::Setting { field: "ticks_per_sample" });
+        }
+        for (field, value) in [
+            ("counts_per_turn", settings.counts_per_turn),
+            ("supply_volt", settings.supply_volt),
+            ("proportional_gain", settings.proportional_gain),
+            ("integral_gain", settings.integral_gain),
+            ("fastest_radps", settings.fastest_radps),
+            ("wheel_tolerance_radps", settings.wheel_tolerance_radps),
+        ] {
+            // Gains of a million and more are typing errors that would overflow.
+            if !(value > 0.0 && value < 1e6) {
+                return Err(ControlLoopError::Setting { field });
+            }
+        }
+        let period_us = period_us(model, settings.ticks_per_sample.into())?;
+        let timing = Timing { period_us, watchdog_us: settings.watchdog_us };
+        Ok(Self {
+            actuators,
+            encoders,
+            sensor,
+            settings,
+            period_s: period_us as f32 * 1e-6,
+            tracker,
+            supervisor: Supervisor::new(timing),
+            telemetry,
+            wanted: [0.0; 2],
+            applied: [0.0; 2],
+            sum: [0.0; 2],
+            ticks: 0,
+            sides: [Side::default(); 2],
+            counted: false,
+            bad_counts: 0,
+        })
+    }
+
+    /// What the host asks for.
+    pub fn command(&mut self, command: Command<2>) {
+        crate::control_loop::follow(
+            command,
+            &mut self.supervisor,
+            &mut self.wanted,
+            self.tracker.model(),
+            self.tracker.sees(),
+        );
+    }
+
+    /// One tick: counts, controls the wheels' speeds, and at a sample measures, predicts and reports.
+    pub fn tick(&mut self, now_us: u64) -> Mode {
+        self.supervisor.begin(now_us);
+        self.count();
+        // The first tick is a sample, and every `ticks_per_sample`th from there on.
+        let frame = (self.ticks == 0 || self.ticks >= self.settings.ticks_per_sample)
+            .then(|| self.sample(now_us));
+
+        let running = self.supervisor.mode() == Mode::Running;
+        self.applied = if running { self.wanted } else { [0.0; 2] };
+        let acted = match running {
+            true => {
+                let mut shares = [0.0; 2];
+                let wheels = self.sides.iter_mut().zip(self.applied);
+                for (share, (side, command)) in shares.iter_mut().zip(wheels) {
+                    let volt = side.control(command, &self.settings, self.period_s);
+                    *share = volt / self.settings.supply_volt;
+                }
+                self.actuators.apply(shares)
+            }
+            false => {
+                self.forget();
+                self.actuators.stop()
+            }
+        };
+        if acted.is_err() {
+            self.supervisor.raise(Alarms::ACTUATOR);
+            self.applied = [0.0; 2];
+            let _ = self.actuators.stop();
+        }
+        for ((sum, side), command) in self.sum.iter_mut().zip(&mut self.sides).zip(self.applied) {
+            *sum += command;
+            side.deviation += side.speed - command;
+        }
+        self.ticks = self.ticks.saturating_add(1);
+        if let Some(frame) = frame {
+            let worst_tick_us = self.supervisor.take_worst_us();
+            let (mode, alarms) = (self.supervisor.mode(), self.supervisor.alarms());
+            self.telemetry.send(Frame { mode, alarms, worst_tick_us, ..frame });
+        }
+        self.supervisor.mode()
+    }
+
+    /// The tick is over: was it in time? If not, the motors go off at once.
+    pub fn finish(&mut self, now_us: u64) -> Mode {
+        let before = self.supervisor.mode();
+        self.supervisor.finish(now_us);
+        if self.supervisor.mode() != before {
+            self.applied = [0.0; 2];
+            let _ = self.actuators.stop();
+        }
+        self.supervisor.mode()
+    }
+
+    /// Where the robot will be at the coming samples (model's units).
+    pub fn path(&self) -> &[[f32; 3]] {
+        self.tracker.path()
+    }
+
+    /// What the loop may do.
+    pub fn mode(&self) -> Mode {
+        self.supervisor.mode()
+    }
+
+    /// What was noticed since the last start or reset.
+    pub fn alarms(&self) -> Alarms {
+        self.supervisor.alarms()
+    }
+
+    /// The devices, to look at.
+    pub fn devices(&self) -> (&A, &E, &S) {
+        (&self.actuators, &self.encoders, &self.sensor)
+    }
+
+    /// Reads the encoders.
+    fn count(&mut self) {
+        let settings = &self.settings;
+        let per_count = core::f32::consts::TAU / settings.counts_per_turn / self.period_s;
+        let Some(counts) = self.encoders.counts() else {
+            self.counted = false;
+            return self.bad_count();
+        };
+        let mut plausible = true;
+        for (side, count) in self.sides.iter_mut().zip(counts) {
+            let change = count.wrapping_sub(side.count) as i16;
+            side.count = count;
+            let speed = f32::from(change) * per_count;
+            if self.counted && speed.abs() <= settings.fastest_radps {
+                side.speed = speed;
+            } else {
+                // The last speed is the best guess; the first count of all is nothing to go by.
+                plausible = false;
+            }
+        }
+        if plausible || !self.counted {
+            self.bad_counts = if self.counted { 0 } else { self.bad_counts };
+        } else {
+            self.bad_count();
+        }
+        self.counted = true;
+    }
+
+    fn bad_count(&mut self) {
+        self.bad_counts = self.bad_counts.saturating_add(1);
+        if self.bad_counts >= BAD_COUNTS {
+            self.supervisor.raise(Alarms::ENCODER);
+        }
+    }
+
+    /// A sample of the model.
+    fn sample(&mut self, now_us: u64) -> Frame {
+        let ticks = f32::from(self.ticks.max(1));
+        let applied = self.sum.map(|sum| sum / ticks);
+        for side in &mut self.sides {
+            let deviation = side.deviation / ticks;
+            side.mean_deviation += WHEEL_SHARE * (deviation - side.mean_deviation);
+            side.deviation = 0.0;
+            if side.mean_deviation.abs() > self.settings.wheel_tolerance_radps {
+                self.supervisor.raise(Alarms::WHEEL);
+            }
+        }
+        (self.sum, self.ticks) = ([0.0; 2], 0);
+        let measured = Measurement::from(self.sensor.measure());
+        let held = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
+        let tracked = self.tracker.sample(&applied, measured, &held);
+        crate::control_loop::take(&tracked, &mut self.supervisor, &mut self.tracker);
+        Frame::of(now_us, &applied, &tracked, self.tracker.path())
+    }
+
+    /// What a robot that stands still does not carry on.
+    fn forget(&mut self) {
+        for side in &mut self.sides {
+            side.integral = 0.0;
+            side.deviation = 0.0;
+            side.mean_deviation = 0.0;
+        }
+    }
+}

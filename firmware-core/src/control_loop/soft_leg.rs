@@ -1,0 +1,227 @@
+//! The loop of a soft pneumatic leg: two chambers, each behind a solenoid valve, a pump for pressure and
+//! one for vacuum.
+//!
+//! The model's inputs are signed voltages: the sign chooses the pump (+ input, − exhaust), the size opens
+//! the valve. A tick is a sample of the model: every tick the tip is predicted, compared with the measured
+//! one where there is one, and predicted over the horizon with the voltages that are commanded now.
+
+use embedded_hal::digital::OutputPin;
+use embedded_hal::pwm::SetDutyCycle;
+
+use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
+use crate::control_loop::telemetry::{Frame, Telemetry};
+use crate::control_loop::tracker::{Measurement, Tracked, Tracker};
+use crate::control_loop::{ActuatorError, Actuators, Command, ControlLoopError, set_share};
+use crate::device::PositionSensor;
+use crate::model::Model;
+
+/// A chamber: its valve, and the pin that connects the valve with the input pump (high) or the exhaust
+/// pump (low).
+#[derive(Debug)]
+pub struct Chamber<V, L> {
+    /// The valve's coil: the duty is the size of the voltage as a share of the supply.
+    pub valve: V,
+    /// Which pump the valve is connected with.
+    pub line: L,
+}
+
+/// Valves and pumps of a leg.
+#[derive(Debug)]
+pub struct Pneumatics<V0, L0, V1, L1, I, X> {
+    /// Bending.
+    pub bending: Chamber<V0, L0>,
+    /// Extension.
+    pub extension: Chamber<V1, L1>,
+    /// Switches the pump for pressure.
+    pub input_pump: I,
+    /// Switches the pump for vacuum.
+    pub exhaust_pump: X,
+}
+
+impl<V: SetDutyCycle, L: OutputPin> Chamber<V, L> {
+    fn apply(&mut self, share: f32) -> Result<(), ActuatorError> {
+        if share == 0.0 {
+            return set_share(&mut self.valve, 0.0);
+        }
+        let line = self.line.set_state((share > 0.0).into()).map_err(|_| ActuatorError);
+        match line {
+            Ok(()) => set_share(&mut self.valve, share.abs()),
+            // On the wrong line an open valve does the opposite.
+            Err(error) => set_share(&mut self.valve, 0.0).and(Err(error)),
+        }
+    }
+}
+
+fn switch(pump: &mut impl OutputPin, on: bool) -> Result<(), ActuatorError> {
+    pump.set_state(on.into()).map_err(|_| ActuatorError)
+}
+
+impl<V0, L0, V1, L1, I, X> Actuators<2> for Pneumatics<V0, L0, V1, L1, I, X>
+where
+    V0: SetDutyCycle,
+    L0: OutputPin,
+    V1: SetDutyCycle,
+    L1: OutputPin,
+    I: OutputPin,
+    X: OutputPin,
+{
+    fn apply(&mut self, shares: [f32; 2]) -> Result<(), ActuatorError> {
+        let [bending, extension] = shares;
+        let input = switch(&mut self.input_pump, shares.iter().any(|share| *share > 0.0));
+        let exhaust = switch(&mut self.exhaust_pump, shares.iter().any(|share| *share < 0.0));
+        let (bending, extension) = (self.bending.apply(bending), self.extension.apply(extension));
+        input.and(exhaust).and(bending).and(extension)
+    }
+
+    fn stop(&mut self) -> Result<(), ActuatorError> {
+        self.apply([0.0; 2])
+    }
+}
+
+/// What fixes the loop of a leg.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SoftLegSettings {
+    /// Voltage of the supply: the full duty of a valve (V).
+    pub supply_volt: f32,
+    /// A running leg stops after this time without a command (µs).
+    pub watchdog_us: u32,
+    /// Samples in a row without a measurement after which it stops, or fewer where the model's error
+    /// bounds do not reach so far.
+    pub blind_samples: u32,
+}
+
+impl Default for SoftLegSettings {
+    /// 12 V, one second without a command, half a second without a measurement at 20 Hz.
+    fn default() -> Self {
+        Self { supply_volt: 12.0, watchdog_us: 1_000_000, blind_samples: 10 }
+    }
+}
+
+/// The loop. `A` moves the leg, `S` sees the tip, `H` samples are looked ahead.
+pub struct SoftLeg<'m, 'a, 'q, A, S, const H: usize> {
+    actuators: A,
+    sensor: S,
+    settings: SoftLegSettings,
+    tracker: Tracker<'m, 'a, 2, 2, H>,
+    supervisor: Supervisor,
+    telemetry: Telemetry<'q>,
+    /// What the host wants (V).
+    wanted: [f32; 2],
+    /// What acts since the last tick (V).
+    applied: [f32; 2],
+}
+
+impl<'m, 'a, 'q, A, S, const H: usize> SoftLeg<'m, 'a, 'q, A, S, H>
+where
+    A: Actuators<2>,
+    S: PositionSensor<2>,
+{
+    /// A leg that is idle; the model's sample time is the period of its ticks.
+    ///
+    /// # Errors
+    /// [`ControlLoopError`]: the model is not one of two states and two inputs, or a setting is out of
+    /// range.
+    pub fn new(
+        model: &'m Model<'a>,
+        actuators: A,
+        sensor: S,
+        settings: SoftLegSettings,
+        telemetry: Telemetry<'q>,
+    ) -> Result<Self, ControlLoopError> {
+        let tracker = Tracker::new(model, settings.blind_samples)?;
+        if !(settings.supply_volt > 0.0 && settings.supply_volt.is_finite()) {
+            return Err(ControlLoopError::Setting { field: "supply_volt" });
+        }
+        let period_us = period_us(model, 1)?;
+        let timing = Timing { period_us, watchdog_us: settings.watchdog_us };
+        Ok(Self {
+            actuators,
+            sensor,
+            settings,
+            tracker,
+            supervisor: Supervisor::new(timing),
+            telemetry,
+            wanted: [0.0; 2],
+            applied: [0.0; 2],
+        })
+    }
+
+    /// What the host asks for.
+    pub fn command(&mut self, command: Command<2>) {
+        crate::control_loop::follow(
+            command,
+            &mut self.supervisor,
+            &mut self.wanted,
+            self.tracker.model(),
+            self.tracker.sees(),
+        );
+    }
+
+    /// One tick: measures, predicts, acts, reports.
+    pub fn tick(&mut self, now_us: u64) -> Mode {
+        self.supervisor.begin(now_us);
+        let measured = Measurement::from(self.sensor.measure());
+        let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
+        let tracked: Tracked<2> = self.tracker.sample(&self.applied, measured, &next);
+        crate::control_loop::take(&tracked, &mut self.supervisor, &mut self.tracker);
+        let next = if self.supervisor.mode() == Mode::Running { next } else { [0.0; 2] };
+        let frame = Frame::of(now_us, &self.applied, &tracked, self.tracker.path());
+        self.applied = next;
+        let acted = match self.supervisor.mode() {
+            Mode::Running => self.actuators.apply(next.map(|u| u / self.settings.supply_volt)),
+            Mode::Idle | Mode::Safe => self.actuators.stop(),
+        };
+        if acted.is_err() {
+            self.supervisor.raise(Alarms::ACTUATOR);
+            self.applied = [0.0; 2];
+            let _ = self.actuators.stop();
+        }
+        let worst_tick_us = self.supervisor.take_worst_us();
+        let (mode, alarms) = (self.supervisor.mode(), self.supervisor.alarms());
+        self.telemetry.send(Frame { mode, alarms, worst_tick_us, ..frame });
+        mode
+    }
+
+    /// The tick is over: was it in time? If not, the actuators go off at once.
+    pub fn finish(&mut self, now_us: u64) -> Mode {
+        let before = self.supervisor.mode();
+        self.supervisor.finish(now_us);
+        if self.supervisor.mode() != before {
+            self.applied = [0.0; 2];
+            let _ = self.actuators.stop();
+        }
+        self.supervisor.mode()
+    }
+
+    /// Where the tip will be at the coming samples (model's units).
+    pub fn path(&self) -> &[[f32; 2]] {
+        self.tracker.path()
+    }
+
+    /// What the loop may do.
+    pub fn mode(&self) -> Mode {
+        self.supervisor.mode()
+    }
+
+    /// What was noticed since the last start or reset.
+    pub fn alarms(&self) -> Alarms {
+        self.supervisor.alarms()
+    }
+
+    /// The devices, to look at.
+    pub fn devices(&self) -> (&A, &S) {
+        (&self.actuators, &self.sensor)
+    }
+}
+
+/// Ticks of `ticks` per sample of a model.
+pub(crate) fn period_us(model: &Model<'_>, ticks: u32) -> Result<u32, ControlLoopError> {
+    let sample_us = model.structure().sample_time_s() * 1e6;
+    let period_us = (sample_us / ticks as f32 + 0.5) as u32;
+    // A timer cannot tick faster, and a day is no control loop.
+    if (10..=86_400_000).contains(&period_us) {
+        Ok(period_us)
+    } else {
+        Err(ControlLoopError::Setting { field: "sample_time_s" })
+    }
+}

@@ -1,0 +1,307 @@
+//! Whether the robot may move.
+//!
+//! ```text
+//!          Start, measured                  any alarm of Alarms::SAFE
+//!  Idle ────────────────────> Running ────────────────────────────────> Safe
+//!    ^                           │                                        │
+//!    └────────── Stop ───────────┘                                        │
+//!    └────────────────────────────── Reset ───────────────────────────────┘
+//! ```
+
+use core::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// What the loop is doing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Mode {
+    /// Waiting for a start; actuators are off.
+    #[default]
+    Idle,
+    /// Following the host's inputs.
+    Running,
+    /// Something is wrong; actuators are off until a reset.
+    Safe,
+}
+
+/// What was noticed since the last start or reset: a set.
+///
+/// ```
+/// use firmware_core::control_loop::Alarms;
+/// let noticed = Alarms::RESIDUAL | Alarms::HOST_SILENT;
+/// assert!(noticed.contains(Alarms::RESIDUAL) && noticed.intersects(Alarms::SAFE));
+/// assert!(!Alarms::RESIDUAL.intersects(Alarms::SAFE), "flagged, the host decides");
+/// assert_eq!(noticed.bits(), 0b1000_0001);
+/// ```
+#[derive(Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Alarms(u16);
+
+impl Alarms {
+    /// No command for the time of the watchdog.
+    pub const HOST_SILENT: Self = Self(1);
+    /// A tick began or ended too late.
+    pub const LATE: Self = Self(1 << 1);
+    /// The clock stood still or went back.
+    pub const CLOCK: Self = Self(1 << 2);
+    /// Several measurements in a row were NaN, infinite or could not be read.
+    pub const SENSOR_BAD: Self = Self(1 << 3);
+    /// No measurement for longer than the prediction can be trusted.
+    pub const SENSOR_LOST: Self = Self(1 << 4);
+    /// An encoder could not be read, or counted faster than a wheel can turn, several times in a row.
+    pub const ENCODER: Self = Self(1 << 5);
+    /// The prediction diverged.
+    pub const DIVERGED: Self = Self(1 << 6);
+    /// What is measured is not what the model says, by its error bounds: slip, a leak, a stuck valve.
+    pub const RESIDUAL: Self = Self(1 << 7);
+    /// One measurement was far beyond the error bounds and was not believed.
+    pub const OUTLIER: Self = Self(1 << 8);
+    /// A wheel does not turn as fast as commanded.
+    pub const WHEEL: Self = Self(1 << 9);
+    /// An actuator could not be set.
+    pub const ACTUATOR: Self = Self(1 << 10);
+    /// A command was not finite; it was not followed, and does not count for the watchdog.
+    pub const BAD_COMMAND: Self = Self(1 << 11);
+    /// The model looked at values outside the range it was trained in.
+    pub const OUT_OF_RANGE: Self = Self(1 << 12);
+
+    /// Those with which a robot does not go on.
+    pub const SAFE: Self = Self(
+        Self::HOST_SILENT.0
+            | Self::LATE.0
+            | Self::CLOCK.0
+            | Self::SENSOR_BAD.0
+            | Self::SENSOR_LOST.0
+            | Self::ENCODER.0
+            | Self::DIVERGED.0
+            | Self::ACTUATOR.0,
+    );
+
+    /// Those that a robot may have while its actuators are off: the others say that it does not move as
+    /// the running robot would.
+    pub const AT_REST: Self = Self(Self::SENSOR_BAD.0 | Self::SENSOR_LOST.0);
+
+    const NAMES: [(Self, &'static str); 13] = [
+        (Self::HOST_SILENT, "host silent"),
+        (Self::LATE, "late"),
+        (Self::CLOCK, "clock"),
+        (Self::SENSOR_BAD, "sensor bad"),
+        (Self::SENSOR_LOST, "sensor lost"),
+        (Self::ENCODER, "encoder"),
+        (Self::DIVERGED, "diverged"),
+        (Self::RESIDUAL, "residual"),
+        (Self::OUTLIER, "outlier"),
+        (Self::WHEEL, "wheel"),
+        (Self::ACTUATOR, "actuator"),
+        (Self::BAD_COMMAND, "bad command"),
+        (Self::OUT_OF_RANGE, "out of range"),
+    ];
+
+    /// None.
+    pub const fn none() -> Self {
+        Self(0)
+    }
+
+    /// One bit each, in the order of the constants.
+    pub const fn bits(self) -> u16 {
+        self.0
+    }
+
+    /// Whether all of `other` are among these.
+    pub const fn contains(self, other: Self) -> bool {
+        self.0 & other.0 == other.0
+    }
+
+    /// Whether some of `other` are among these.
+    pub const fn intersects(self, other: Self) -> bool {
+        self.0 & other.0 != 0
+    }
+
+    /// Whether there is none.
+    pub const fn is_empty(self) -> bool {
+        self.0 == 0
+    }
+
+    /// Each of them with its name.
+    pub fn iter(self) -> impl Iterator<Item = (Self, &'static str)> {
+        Self::NAMES.into_iter().filter(move |(alarm, _)| self.contains(*alarm))
+    }
+}
+
+impl core::ops::BitAnd for Alarms {
+    type Output = Self;
+    fn bitand(self, other: Self) -> Self {
+        Self(self.0 & other.0)
+    }
+}
+
+impl core::ops::BitOr for Alarms {
+    type Output = Self;
+    fn bitor(self, other: Self) -> Self {
+        Self(self.0 | other.0)
+    }
+}
+
+impl core::ops::BitOrAssign for Alarms {
+    fn bitor_assign(&mut self, other: Self) {
+        self.0 |= other.0;
+    }
+}
+
+/// Names, separated by commas; `none`.
+impl fmt::Display for Alarms {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.is_empty() {
+            return f.write_str("none");
+        }
+        let mut separator = "";
+        for (_, name) in self.iter() {
+            write!(f, "{separator}{name}")?;
+            separator = ", ";
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Debug for Alarms {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Alarms({self})")
+    }
+}
+
+/// Times of a loop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Timing {
+    /// Time from one tick to the next (µs).
+    pub period_us: u32,
+    /// A running robot stops after this time without a command (µs).
+    pub watchdog_us: u32,
+}
+
+/// The state machine.
+///
+/// ```
+/// use firmware_core::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
+/// let mut supervisor = Supervisor::new(Timing { period_us: 10_000, watchdog_us: 1_000_000 });
+/// supervisor.begin(0);
+/// supervisor.start();
+/// for tick in 1..=100 {
+///     supervisor.begin(tick * 10_000);
+///     assert_eq!(supervisor.mode(), Mode::Running);
+/// }
+/// supervisor.begin(1_010_000);
+/// assert_eq!((supervisor.mode(), supervisor.alarms()), (Mode::Safe, Alarms::HOST_SILENT));
+/// ```
+#[derive(Clone, Debug)]
+pub struct Supervisor {
+    timing: Timing,
+    mode: Mode,
+    alarms: Alarms,
+    /// When the last tick began.
+    began_us: Option<u64>,
+    /// When the host was last heard, by the clock of the ticks.
+    heard_us: u64,
+    /// Ticks since then: they count on when the clock does not.
+    silent_ticks: u32,
+    worst_us: u32,
+}
+
+impl Supervisor {
+    /// Idle.
+    pub fn new(timing: Timing) -> Self {
+        Self {
+            timing,
+            mode: Mode::Idle,
+            alarms: Alarms::none(),
+            began_us: None,
+            heard_us: 0,
+            silent_ticks: 0,
+            worst_us: 0,
+        }
+    }
+
+    /// What the loop may do.
+    pub fn mode(&self) -> Mode {
+        self.mode
+    }
+
+    /// What was noticed since the last start or reset.
+    pub fn alarms(&self) -> Alarms {
+        self.alarms
+    }
+
+    /// A tick begins: was the last one a period ago, is the host alive?
+    pub fn begin(&mut self, now_us: u64) {
+        if let Some(last_us) = self.began_us.replace(now_us) {
+            let period_us = u64::from(self.timing.period_us);
+            match now_us.checked_sub(last_us) {
+                None => self.raise(Alarms::CLOCK),
+                Some(elapsed) if elapsed < period_us / 2 => self.raise(Alarms::CLOCK),
+                Some(elapsed) if elapsed > period_us + period_us / 2 => self.raise(Alarms::LATE),
+                Some(_) => {}
+            }
+        }
+        if self.mode == Mode::Running {
+            self.silent_ticks = self.silent_ticks.saturating_add(1);
+            let ticked_us = u64::from(self.silent_ticks) * u64::from(self.timing.period_us);
+            let silent_us = now_us.saturating_sub(self.heard_us).max(ticked_us);
+            if silent_us > u64::from(self.timing.watchdog_us) {
+                self.raise(Alarms::HOST_SILENT);
+            }
+        }
+    }
+
+    /// The tick ends.
+    pub fn finish(&mut self, now_us: u64) {
+        let began_us = self.began_us.unwrap_or(now_us);
+        let Some(taken_us) = now_us.checked_sub(began_us) else {
+            return self.raise(Alarms::CLOCK);
+        };
+        self.worst_us = self.worst_us.max(u32::try_from(taken_us).unwrap_or(u32::MAX));
+        if taken_us > u64::from(self.timing.period_us) {
+            self.raise(Alarms::LATE);
+        }
+    }
+
+    /// The longest tick since the last call (µs).
+    pub fn take_worst_us(&mut self) -> u32 {
+        core::mem::take(&mut self.worst_us)
+    }
+
+    /// The host is alive.
+    pub fn heard(&mut self) {
+        self.heard_us = self.began_us.unwrap_or(0);
+        self.silent_ticks = 0;
+    }
+
+    /// Idle → Running.
+    pub fn start(&mut self) {
+        if self.mode == Mode::Idle {
+            self.mode = Mode::Running;
+            self.alarms = Alarms::none();
+            self.heard();
+        }
+    }
+
+    /// Running → Idle.
+    pub fn stop(&mut self) {
+        if self.mode == Mode::Running {
+            self.mode = Mode::Idle;
+        }
+    }
+
+    /// Safe → Idle.
+    pub fn reset(&mut self) {
+        if self.mode == Mode::Safe {
+            self.mode = Mode::Idle;
+            self.alarms = Alarms::none();
+        }
+    }
+
+    /// Something was noticed.
+    pub fn raise(&mut self, alarms: Alarms) {
+        self.alarms |= alarms;
+        if self.mode == Mode::Running && alarms.intersects(Alarms::SAFE) {
+            self.mode = Mode::Safe;
+        }
+    }
+}

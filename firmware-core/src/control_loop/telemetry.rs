@@ -1,0 +1,117 @@
+//! What a loop tells the host: one frame per sample of the model.
+//!
+//! Frames in a row are a log for the trainer: the row of a frame holds its `measured` coordinates and
+//! the `applied` inputs of the frame after it, which act from the one to the other. A frame without a
+//! measurement, or a missing sequence number, ends a trajectory.
+
+use heapless::Vec;
+use heapless::spsc::{Consumer, Producer};
+use serde::{Deserialize, Serialize};
+
+use crate::capacity::{MAX_INPUTS, MAX_STATES};
+use crate::control_loop::supervisor::{Alarms, Mode};
+use crate::control_loop::tracker::Tracked;
+
+/// One sample.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Frame {
+    /// Number of the sample, counted on also when a frame is dropped; wraps.
+    pub sequence: u32,
+    /// Time of the sample (µs).
+    pub time_us: u64,
+    /// What the loop is doing after this tick.
+    pub mode: Mode,
+    /// What was noticed since the last start or reset.
+    pub alarms: Alarms,
+    /// Mean inputs that acted since the sample before, in the model's order and units.
+    pub applied: Vec<f32, MAX_INPUTS>,
+    /// Coordinates as measured now, in the model's order and units; empty without a measurement that was
+    /// used.
+    pub measured: Vec<f32, MAX_STATES>,
+    /// Coordinates that the model predicted for now; empty while its history fills.
+    pub predicted: Vec<f32, MAX_STATES>,
+    /// Measured − predicted, angles on the circle; empty where one of them is missing. It is here for
+    /// measurements, too, that were not believed.
+    pub residual: Vec<f32, MAX_STATES>,
+    /// Steps predicted since the last measurement that was used.
+    pub steps: u32,
+    /// Coordinates that the model predicts for the end of its horizon; empty without them.
+    pub ahead: Vec<f32, MAX_STATES>,
+    /// The longest tick since the frame before (µs).
+    pub worst_tick_us: u32,
+    /// Frames dropped so far.
+    pub dropped: u32,
+}
+
+/// A list of a slice, which is not longer than its capacity.
+fn list<const C: usize>(numbers: &[f32]) -> Vec<f32, C> {
+    numbers.iter().copied().take(C).collect()
+}
+
+/// The sending end of the queue between a loop and its transmitter: it never waits.
+///
+/// ```
+/// use firmware_core::control_loop::telemetry::{Frame, Telemetry};
+/// let mut queue = heapless::spsc::Queue::<Frame, 3>::new(); // room for two
+/// let (producer, mut consumer) = queue.split();
+/// let mut telemetry = Telemetry::new(producer);
+/// for _ in 0..5 {
+///     telemetry.send(Frame::default());
+/// }
+/// assert_eq!(telemetry.dropped(), 3);
+/// assert_eq!([consumer.dequeue().unwrap().sequence, consumer.dequeue().unwrap().sequence], [0, 1]);
+/// telemetry.send(Frame::default());
+/// let frame = consumer.dequeue().unwrap();
+/// assert_eq!((frame.sequence, frame.dropped), (5, 3));
+/// ```
+pub struct Telemetry<'q> {
+    queue: Producer<'q, Frame>,
+    sequence: u32,
+    dropped: u32,
+}
+
+/// The end of the queue from which frames are sent.
+pub type Frames<'q> = Consumer<'q, Frame>;
+
+impl<'q> Telemetry<'q> {
+    /// The sending end.
+    pub fn new(queue: Producer<'q, Frame>) -> Self {
+        Self { queue, sequence: 0, dropped: 0 }
+    }
+
+    /// Numbers a frame and puts it into the queue; drops it when the queue is full.
+    pub fn send(&mut self, frame: Frame) {
+        let frame = Frame { sequence: self.sequence, dropped: self.dropped, ..frame };
+        self.sequence = self.sequence.wrapping_add(1);
+        if self.queue.enqueue(frame).is_err() {
+            self.dropped = self.dropped.saturating_add(1);
+        }
+    }
+
+    /// Frames dropped so far.
+    pub fn dropped(&self) -> u32 {
+        self.dropped
+    }
+}
+
+impl Frame {
+    /// The frame of a sample.
+    pub(crate) fn of<const N: usize, const M: usize>(
+        time_us: u64,
+        applied: &[f32; M],
+        tracked: &Tracked<N>,
+        path: &[[f32; N]],
+    ) -> Self {
+        let optional = |x: &Option<[f32; N]>| list(x.as_ref().map_or(&[], |x| x.as_slice()));
+        Self {
+            time_us,
+            applied: list(applied),
+            measured: optional(&tracked.measured),
+            predicted: optional(&tracked.predicted),
+            residual: optional(&tracked.residual),
+            steps: tracked.steps,
+            ahead: list(path.last().map_or(&[], |x| x.as_slice())),
+            ..Self::default()
+        }
+    }
+}

@@ -1,0 +1,241 @@
+//! The model beside the robot: once per sample it predicts where the robot is now, takes what is
+//! measured, and looks ahead.
+
+use crate::control_loop::ControlLoopError;
+use crate::control_loop::monitor::{GATE, Monitor, Verdict};
+use crate::control_loop::supervisor::Alarms;
+use crate::model::{Model, Space};
+use crate::scalar::Scalar;
+use crate::{PredictError, Predictor, PredictorState};
+
+/// Measurements in a row that may be NaN or unreadable before the sensor counts as bad.
+pub const BAD_MEASUREMENTS: u8 = 3;
+/// Measurements in a row that are not believed; the next one is taken as it comes.
+pub const OUTLIERS: u8 = 3;
+
+/// What a sensor said at a sample.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Measurement<const N: usize> {
+    /// Coordinates in the model's units.
+    Taken([f32; N]),
+    /// Nothing new.
+    Missing,
+    /// The sensor could not be read.
+    Unreadable,
+}
+
+impl<const N: usize, E> From<Result<Option<[f32; N]>, E>> for Measurement<N> {
+    fn from(result: Result<Option<[f32; N]>, E>) -> Self {
+        match result {
+            Ok(Some(coordinates)) => Self::Taken(coordinates),
+            Ok(None) => Self::Missing,
+            Err(_) => Self::Unreadable,
+        }
+    }
+}
+
+/// One sample of the robot beside its model.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Tracked<const N: usize> {
+    /// The mean inputs since the sample before are not here: the loop knows them.
+    ///
+    /// Where the model says the robot is; `None` while its history fills.
+    pub predicted: Option<[f32; N]>,
+    /// Where it was measured, if the measurement was used.
+    pub measured: Option<[f32; N]>,
+    /// Measured − predicted, angles on the circle; also of a measurement that was not believed.
+    pub residual: Option<[f32; N]>,
+    /// Steps predicted since the last measurement that was used; 0 when nothing was predicted.
+    pub steps: u32,
+    /// The largest residual as a multiple of its error bound; 0 without bounds.
+    pub ratio: f32,
+    /// What was noticed at this sample.
+    pub alarms: Alarms,
+}
+
+/// Predictor, history and monitor of a robot with `N` coordinates and `M` inputs, looking `H` samples
+/// ahead.
+///
+/// What it predicts for a sample is bit by bit what `trainer evaluate` predicts on the recorded log:
+/// rolled out from the last measurement that was used, with the inputs that were applied.
+#[derive(Clone, Debug)]
+pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
+    predictor: Predictor<'m, 'a>,
+    state: PredictorState,
+    monitor: Monitor,
+    /// Samples without a measurement that was used.
+    blind: u32,
+    /// The most of them that are allowed.
+    blind_limit: u32,
+    bad: u8,
+    outliers: u8,
+    path: [[f32; N]; H],
+    /// How much of the path is there.
+    ahead: usize,
+}
+
+impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, M, H> {
+    /// A tracker that has seen nothing; it tolerates at most `blind_samples` in a row without a
+    /// measurement, fewer where the model's error bounds do not reach so far.
+    ///
+    /// # Errors
+    /// [`ControlLoopError::DimensionMismatch`].
+    pub fn new(model: &'m Model<'a>, blind_samples: u32) -> Result<Self, ControlLoopError> {
+        let structure = model.structure();
+        for (field, expected, found) in
+            [("states", N, structure.states().len()), ("inputs", M, structure.inputs().len())]
+        {
+            if expected != found {
+                return Err(ControlLoopError::DimensionMismatch { field, expected, found });
+            }
+        }
+        let reach = model.error_bounds().and_then(|bounds| bounds.horizons().last().copied());
+        Ok(Self {
+            predictor: Predictor::new(model),
+            state: PredictorState::new(),
+            monitor: Monitor::default(),
+            blind: 0,
+            blind_limit: reach.map_or(blind_samples, |reach| reach.min(blind_samples)),
+            bad: 0,
+            outliers: 0,
+            path: [[0.0; N]; H],
+            ahead: 0,
+        })
+    }
+
+    /// The model.
+    pub fn model(&self) -> &'m Model<'a> {
+        self.predictor.model()
+    }
+
+    /// Whether measured and predicted can be compared: the model has error bounds.
+    pub fn monitored(&self) -> bool {
+        self.model().error_bounds().is_some()
+    }
+
+    /// Whether the last sample had a measurement that was used.
+    pub fn sees(&self) -> bool {
+        self.blind == 0 && !self.state.history().is_empty()
+    }
+
+    /// Where the robot will be at each of the coming samples with the inputs held; shorter than `H`
+    /// when the prediction diverges on the way, empty while the history fills.
+    pub fn path(&self) -> &[[f32; N]] {
+        self.path.get(..self.ahead).unwrap_or(&[])
+    }
+
+    /// Takes a sample: what was `applied` since the one before it, on average, and what is `measured`
+    /// now; then looks ahead with the inputs `held`.
+    pub fn sample(
+        &mut self,
+        applied: &[f32; M],
+        measured: Measurement<N>,
+        held: &[f32; M],
+    ) -> Tracked<N> {
+        let mut alarms = Alarms::none();
+        let mut ahead = self.state.clone();
+        let mut predicted = None;
+        match self.predictor.step(&mut ahead, applied) {
+            Ok(()) => predicted = Some(self.coordinates(&ahead)),
+            Err(PredictError::NotReady { .. }) => {}
+            // Inputs are finite and of the right number: what is left is divergence.
+            Err(_) => alarms |= Alarms::DIVERGED,
+        }
+        if ahead.out_of_range().is_some() {
+            alarms |= Alarms::OUT_OF_RANGE;
+        }
+        let steps = predicted.map_or(0, |_| ahead.step());
+
+        let taken = match measured {
+            Measurement::Taken(x) if x.iter().all(|x| x.is_finite()) => {
+                self.bad = 0;
+                Some(x)
+            }
+            Measurement::Missing => None,
+            Measurement::Taken(_) | Measurement::Unreadable => {
+                self.bad = self.bad.saturating_add(1);
+                if self.bad >= BAD_MEASUREMENTS {
+                    alarms |= Alarms::SENSOR_BAD;
+                }
+                None
+            }
+        };
+        let residual = taken.zip(predicted).map(|(x, expected)| self.residual(&x, &expected));
+        let verdict = match (residual, self.model().error_bounds()) {
+            (Some(residual), Some(bounds)) => self.monitor.update(bounds, steps, &residual),
+            _ => Verdict::default(),
+        };
+        if verdict.alarm {
+            alarms |= Alarms::RESIDUAL;
+        }
+        let believed = verdict.ratio <= GATE || self.outliers >= OUTLIERS;
+        if taken.is_some() {
+            self.outliers = if believed { 0 } else { self.outliers + 1 };
+        }
+        let used = taken.filter(|_| believed);
+        match used {
+            Some(x) => {
+                if verdict.ratio > GATE {
+                    // The robot really is elsewhere: its history belongs to the place before.
+                    self.state = PredictorState::new();
+                }
+                // Finite, and of the right length: it cannot be refused.
+                let _ = self.predictor.observe(&mut self.state, applied, &x);
+                self.blind = 0;
+            }
+            None => {
+                if taken.is_some() {
+                    alarms |= Alarms::OUTLIER;
+                }
+                self.blind = self.blind.saturating_add(1);
+                if self.blind > self.blind_limit {
+                    alarms |= Alarms::SENSOR_LOST;
+                }
+                // A gap in a history that was not full, or no prediction: begin anew.
+                self.state = if predicted.is_some() { ahead } else { PredictorState::new() };
+            }
+        }
+
+        let (predictor, mut future) = (self.predictor, self.state.clone());
+        self.ahead = 0;
+        for place in &mut self.path {
+            match predictor.step(&mut future, held) {
+                Ok(()) => {}
+                Err(PredictError::NotReady { .. }) => break,
+                Err(_) => {
+                    alarms |= Alarms::DIVERGED;
+                    break;
+                }
+            }
+            let _ = predictor.coordinates(&future, place);
+            self.ahead += 1;
+        }
+        let ratio = verdict.ratio;
+        Tracked { predicted, measured: used, residual, steps, ratio, alarms }
+    }
+
+    /// Forgets the residuals that have added up, not the history.
+    pub fn forget_residuals(&mut self) {
+        self.monitor.reset();
+    }
+
+    fn coordinates(&self, state: &PredictorState) -> [f32; N] {
+        let mut x = [0.0; N];
+        // Of the right length: it cannot be refused.
+        let _ = self.predictor.coordinates(state, &mut x);
+        x
+    }
+
+    fn residual(&self, measured: &[f32; N], predicted: &[f32; N]) -> [f32; N] {
+        let mut residual = [0.0; N];
+        let pairs = measured.iter().zip(predicted).zip(self.model().structure().states());
+        for (to, ((x, expected), state)) in residual.iter_mut().zip(pairs) {
+            let difference = x - expected;
+            *to = match state.space {
+                Space::Line => difference,
+                Space::Circle => difference.wrap(),
+            };
+        }
+        residual
+    }
+}
