@@ -86,7 +86,7 @@ const TERMS: (u16, u16) = (0x0004, 4);
 const RANGES: (u16, u16) = (0x8001, 3);
 const ERROR_BOUNDS: (u16, u16) = (0x8002, 5);
 
-const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+pub(crate) const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
 
 /// Puts bytes at an address divisible by four, as a blob needs them.
 ///

@@ -36,6 +36,7 @@
 //! | [`predictor`] | `Predictor` (immutable) and `PredictorState`: step, rollout, held inputs |
 //! | `registers`, `kernel` (private) | where the numbers of a step lie, and how it computes them |
 //! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
+//! | [`link`] | messages between host and controller over a serial line |
 //! | [`device`] | encoders, position sensors and the clock, as traits |
 //! | [`capacity`] | what there is room for |
 #![no_std]
@@ -61,6 +62,7 @@ pub mod dictionary;
 pub mod error_bounds;
 pub mod history;
 mod kernel;
+pub mod link;
 pub mod model;
 pub mod predictor;
 mod registers;
