@@ -10,8 +10,10 @@
 //! | [`integrate`] | [`Integrator`]: exact, RK4 or Euler, and the two methods themselves |
 //! | [`drive`] | differential drive (ROSbot), the paper's system (drive) |
 //! | [`rosbot`] | skid-steered ROSbot with motors, encoders and slip, an invented but plausible plant |
+//! | [`skid_steer`] | the same without the controllers: wheels and body under motor voltages |
 //! | [`arm`] | two-revolute-joint arm, the paper's system (arm) |
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
+//! | [`mcu`] | the simulated microcontroller: clock, outputs, sensors, misuse |
 //! | [`record`] | logs as CSV, one file per trajectory |
 //! | [`paper`] | the logs that repeat the paper's experiments |
 //!
@@ -45,12 +47,14 @@ pub mod drive;
 mod excitation;
 pub mod integrate;
 mod log;
+pub mod mcu;
 mod normal;
 pub mod paper;
 pub mod plant;
 pub mod record;
 pub mod rosbot;
 mod sinc;
+pub mod skid_steer;
 pub mod soft_leg;
 
 pub use integrate::Integrator;
