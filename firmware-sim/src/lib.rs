@@ -13,6 +13,7 @@
 //! | [`skid_steer`] | the same without the controllers: wheels and body under motor voltages |
 //! | [`arm`] | two-revolute-joint arm, the paper's system (arm) |
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
+//! | [`bench`](mod@bench) | ROSbot and soft leg, wired to a simulated microcontroller |
 //! | [`mcu`] | the simulated microcontroller: clock, outputs, sensors, misuse |
 //! | [`record`] | logs as CSV, one file per trajectory |
 //! | [`paper`] | the logs that repeat the paper's experiments |
@@ -43,6 +44,7 @@
 //! ```
 
 pub mod arm;
+pub mod bench;
 pub mod drive;
 mod excitation;
 pub mod integrate;
