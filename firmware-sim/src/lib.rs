@@ -15,6 +15,7 @@
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
 //! | [`bench`](mod@bench) | ROSbot and soft leg, wired to a simulated microcontroller |
 //! | [`mcu`] | the simulated microcontroller: clock, outputs, sensors, misuse |
+//! | [`fault`], [`faulty`] | what goes wrong and when; devices that show it |
 //! | [`record`] | logs as CSV, one file per trajectory |
 //! | [`paper`] | the logs that repeat the paper's experiments |
 //!
@@ -47,6 +48,8 @@ pub mod arm;
 pub mod bench;
 pub mod drive;
 mod excitation;
+pub mod fault;
+pub mod faulty;
 pub mod integrate;
 mod log;
 pub mod mcu;

@@ -9,6 +9,7 @@
 //!
 //! A direction pin is low after a reset, so that the robot's usual direction needs no setting up.
 
+use crate::fault::{FaultKind, Faults};
 use crate::mcu::board::ClaimError;
 use crate::mcu::position_sensor::MotionCaptureSettings;
 use crate::mcu::{Board, Encoder, MotionCapture, Pin, Pwm, VirtualClock, Wire};
@@ -144,6 +145,12 @@ impl RosbotBench {
         })
     }
 
+    /// Sets slip and sag to what the faults say now; call it once per tick.
+    pub fn apply(&mut self, faults: &Faults) {
+        self.slip = [0, 1].map(|side| faults.act(FaultKind::Slip, Some(side)).unwrap_or(0.0));
+        self.sag = faults.act(FaultKind::Sag, None).unwrap_or(0.0);
+    }
+
     /// Lets `us` microseconds pass, and the plant catch up with the clock, under held outputs.
     pub fn advance_us(&mut self, us: u64) {
         self.clock.advance_us(us);
@@ -230,6 +237,19 @@ mod tests {
         advance(&mut bench, 200);
         // (9 V − 0.6 V) · 2.2 / 1.044.
         assert!((bench.motion().wheels[0].speed_radps - 17.701).abs() < 1e-3);
+    }
+
+    #[test]
+    fn faults_reach_the_plant() {
+        let (mut bench, _) = bench();
+        let faults = ["slip:1@0..1=0.5".parse().unwrap(), "sag@0..1=0.25".parse().unwrap()];
+        let faults = Faults::new(bench.clock(), faults, 1);
+        bench.apply(&faults);
+        assert_eq!((bench.slip, bench.sag), ([0.0, 0.5], 0.25));
+        bench.advance_us(1_000_000);
+        bench.apply(&faults);
+        assert_eq!((bench.slip, bench.sag), ([0.0, 0.0], 0.0));
+        assert_eq!([FaultKind::Slip, FaultKind::Sag].map(|kind| faults.injected(kind)), [1, 1]);
     }
 
     #[test]

@@ -10,6 +10,7 @@
 //! With both pumps running, the leg moves exactly as [`SoftLeg::step`](crate::Plant::step) says for
 //! the signed voltages: + on the pressure line, − on the vacuum line.
 
+use crate::fault::{FaultKind, Faults};
 use crate::mcu::board::ClaimError;
 use crate::mcu::position_sensor::MotionCaptureSettings;
 use crate::mcu::{Board, MotionCapture, Pin, Pwm, VirtualClock, Wire};
@@ -168,6 +169,21 @@ impl SoftLegBench {
         })
     }
 
+    /// Sets valves, leaks, pumps and sag to what the faults say now; call it once per tick.
+    pub fn apply(&mut self, faults: &Faults) {
+        for unit in 0..2 {
+            let act = |kind| faults.act(kind, Some(unit));
+            self.stuck[unit] = if faults.strikes(FaultKind::StuckValve, Some(unit)) {
+                Some(StuckValve::AsItIs)
+            } else {
+                act(FaultKind::OpenValve).map(StuckValve::At)
+            };
+            self.leaks[unit] = 1.0 + 99.0 * act(FaultKind::Leak).unwrap_or(0.0);
+            self.pump_strength[unit] = 1.0 - act(FaultKind::Pump).unwrap_or(0.0);
+        }
+        self.sag = faults.act(FaultKind::Sag, None).unwrap_or(0.0);
+    }
+
     /// Lets `us` microseconds pass, and the plant catch up with the clock, under held outputs.
     pub fn advance_us(&mut self, us: u64) {
         self.clock.advance_us(us);
@@ -308,6 +324,29 @@ mod tests {
         assert!(leaking < 0.7 * bending, "{leaking}");
         let [_, weak] = settled(|bench| bench.pump_strength[1] = 0.5);
         assert!((weak / extension - 0.5).abs() < 0.02, "{weak}");
+    }
+
+    #[test]
+    fn faults_reach_the_plant() {
+        let (mut bench, _) = bench();
+        let faults = [
+            "stuck-valve:0@0..1=1",
+            "open-valve:1@0..1=0.3",
+            "leak:1@0..1=0.5",
+            "pump:0@0..1=0.25",
+            "sag@0..1=0.1",
+        ];
+        let faults = Faults::new(bench.clock(), faults.map(|text| text.parse().unwrap()), 1);
+        bench.apply(&faults);
+        assert_eq!(bench.stuck, [Some(StuckValve::AsItIs), Some(StuckValve::At(0.3))]);
+        assert_eq!((bench.leaks, bench.pump_strength), ([1.0, 50.5], [0.75, 1.0]));
+        assert_eq!(bench.volts(), [-0.0, -0.0]);
+        assert_eq!(bench.sag, 0.1);
+        assert!(faults.injections().all(|(_, times)| times == 1));
+        bench.advance_us(1_000_000);
+        bench.apply(&faults);
+        assert_eq!((bench.stuck, bench.leaks), ([None; 2], [1.0; 2]));
+        assert_eq!((bench.pump_strength, bench.sag), ([1.0; 2], 0.0));
     }
 
     #[test]
