@@ -10,8 +10,12 @@
 //! | [`integrate`] | [`Integrator`]: exact, RK4 or Euler, and the two methods themselves |
 //! | [`drive`] | differential drive (ROSbot), the paper's system (drive) |
 //! | [`rosbot`] | skid-steered ROSbot with motors, encoders and slip, an invented but plausible plant |
+//! | [`skid_steer`] | the same without the controllers: wheels and body under motor voltages |
 //! | [`arm`] | two-revolute-joint arm, the paper's system (arm) |
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
+//! | [`bench`](mod@bench) | ROSbot and soft leg, wired to a simulated microcontroller |
+//! | [`mcu`] | the simulated microcontroller: clock, outputs, sensors, misuse |
+//! | [`fault`], [`faulty`] | what goes wrong and when; devices that show it |
 //! | [`record`] | logs as CSV, one file per trajectory |
 //! | [`paper`] | the logs that repeat the paper's experiments |
 //!
@@ -41,16 +45,21 @@
 //! ```
 
 pub mod arm;
+pub mod bench;
 pub mod drive;
 mod excitation;
+pub mod fault;
+pub mod faulty;
 pub mod integrate;
 mod log;
+pub mod mcu;
 mod normal;
 pub mod paper;
 pub mod plant;
 pub mod record;
 pub mod rosbot;
 mod sinc;
+pub mod skid_steer;
 pub mod soft_leg;
 
 pub use integrate::Integrator;

@@ -49,7 +49,11 @@ impl<const OUTPUTS: usize> Sensor<OUTPUTS> {
     /// Outputs as they are.
     pub(crate) const EXACT: Self = Self { std: [0.0; OUTPUTS], decimals: None };
 
-    fn measure(&self, mut outputs: [f64; OUTPUTS], rng: &mut ChaCha8Rng) -> [f64; OUTPUTS] {
+    pub(crate) fn measure(
+        &self,
+        mut outputs: [f64; OUTPUTS],
+        rng: &mut ChaCha8Rng,
+    ) -> [f64; OUTPUTS] {
         for (output, std) in outputs.iter_mut().zip(self.std) {
             if std > 0.0 {
                 *output += std * standard_normal(rng);

@@ -23,33 +23,7 @@
 //!
 //! One count is 0.385 rad/s of ω̂, so that held speeds ripple.
 //!
-//! # Wheels
-//!
-//! ```text
-//! T ω' = K (U − b ω − U_c sign ω) − ω        moving
-//! ω' = 0 while |U| ≤ U_b                     at rest: the dead-band of stiction
-//! ```
-//!
-//! K is the speed per volt without friction, T the lag, b ω the viscous and U_c the Coulomb friction
-//! as voltages, U_b ≥ U_c what it takes to break loose. Between two controller ticks this has a
-//! closed solution, which is what is used, stops and restarts included.
-//!
-//! # Body
-//!
-//! The tyres of a side pull in proportion to how fast they slide, so the ground speed g of a side
-//! follows its wheels with a lag, and slides in proportion to the acceleration; at speed a share of
-//! the way is lost besides:
-//!
-//! ```text
-//! T_g g' = r ω − g,   s = g (1 − c |g|)      for each side
-//! v = (s_r + s_l)/2,  φ' = (s_r − s_l)/(λ L)
-//! x' = v cos φ − w sin φ,   y' = v sin φ + w cos φ,   w = −T_w v φ'
-//! ```
-//!
-//! λ > 1 is the effective track of skid steering, in nominal tracks: the robot turns less than r/L
-//! says. w is the sideways drift out of a bend, in proportion to the centripetal acceleration; it
-//! moves the instantaneous centre of rotation T_w v ahead of the axle's line. Left and right are
-//! alike. How a turn loads the motors is left out: the controllers would hide it.
+//! What the voltages do is in [`skid_steer`](crate::skid_steer).
 //!
 //! The body is integrated by RK4 in two steps from the last controller tick, however time is cut
 //! into steps: splitting a step changes nothing but rounding.
@@ -58,6 +32,7 @@
 
 use crate::integrate::Numerical;
 use crate::plant::{Plant, Variable};
+use crate::skid_steer::{Motion, Wheel};
 use std::f64::consts::TAU;
 use std::num::NonZeroU32;
 
@@ -130,6 +105,36 @@ impl Default for RosbotParameters {
     }
 }
 
+impl RosbotParameters {
+    /// Refuses what the equations make no sense with.
+    pub(crate) fn check(&self) -> Result<(), RosbotError> {
+        let p = self;
+        const MOST: f64 = f64::INFINITY;
+        let fastest_mps = p.wheel_radius_m * p.speed_per_volt * p.supply_volt;
+        for (field, value, above, below) in [
+            ("wheel_radius_m", p.wheel_radius_m, 0.0, MOST),
+            ("track_m", p.track_m, 0.0, MOST),
+            ("track_ratio", p.track_ratio, 1.0, MOST),
+            ("slide_lag_s", p.slide_lag_s, 0.0, MOST),
+            ("supply_volt", p.supply_volt, 0.0, MOST),
+            ("speed_per_volt", p.speed_per_volt, 0.0, MOST),
+            ("slip_s_per_m", p.slip_s_per_m, 0.0, 0.5 / fastest_mps),
+            ("drift_s", p.drift_s, 0.0, MOST),
+            ("motor_lag_s", p.motor_lag_s, 0.0, MOST),
+            ("viscous_volt_s", p.viscous_volt_s, 0.0, MOST),
+            ("break_away_volt", p.break_away_volt, 0.0, p.supply_volt),
+            ("coulomb_volt", p.coulomb_volt, 0.0, p.break_away_volt),
+            ("proportional_gain", p.proportional_gain, 0.0, MOST),
+            ("integral_gain", p.integral_gain, 0.0, MOST),
+        ] {
+            if !(value > above && value < below) {
+                return Err(RosbotError::OutOfRange { field, value, above, below });
+            }
+        }
+        Ok(())
+    }
+}
+
 /// Why a [`Rosbot`] cannot be made.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -171,35 +176,37 @@ pub enum RosbotError {
 pub struct Rosbot {
     parameters: RosbotParameters,
     /// As of the last controller tick.
-    state: State,
+    motion: Motion,
+    /// Of the right and the left side.
+    controllers: [SpeedController; 2],
     /// Time since the last controller tick (s). From [`TICK_S`] on, the next tick is due: it takes
     /// the command of the step that goes on from there.
     since_tick_s: f64,
 }
 
-/// What moves: the sides are (right, left).
+/// The PI controller of one side.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct State {
-    sides: [Side; 2],
-    /// Ground speeds g of the sides (m/s).
-    ground_mps: [f64; 2],
-    /// x (m), y (m), φ (rad).
-    pose: [f64; 3],
+struct SpeedController {
+    /// Voltage U until the next tick.
+    volt: f64,
+    /// Integral part I (V).
+    integral: f64,
+    /// Encoder count seen last.
+    count: i32,
 }
 
-/// The wheels of one side with their motor and controller.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Side {
-    /// Wheel speed ω (rad/s).
-    speed: f64,
-    /// Angle turned since the start (rad).
-    angle: f64,
-    /// Voltage U.
-    volt: f64,
-    /// Integral part I of the controller (V).
-    integral: f64,
-    /// Encoder count that the controller saw last.
-    count: i32,
+impl SpeedController {
+    /// One tick: the command (rad/s) and the encoder count now.
+    fn tick(self, p: &RosbotParameters, command: f64, count: i32) -> Self {
+        let turns = f64::from(count.wrapping_sub(self.count)) / f64::from(p.counts_per_turn.get());
+        let error = command - TAU * turns / TICK_S;
+        let wanted = p.proportional_gain * error + self.integral;
+        let volt = wanted.clamp(-p.supply_volt, p.supply_volt);
+        let winds_up = volt != wanted && error * wanted > 0.0;
+        let integral =
+            if winds_up { self.integral } else { self.integral + p.integral_gain * error * TICK_S };
+        Self { volt, integral, count }
+    }
 }
 
 impl Rosbot {
@@ -209,130 +216,41 @@ impl Rosbot {
     ///
     /// [`RosbotError::OutOfRange`] for a parameter with which the equations make no sense.
     pub fn new(parameters: RosbotParameters) -> Result<Self, RosbotError> {
-        let p = &parameters;
-        const MOST: f64 = f64::INFINITY;
-        let fastest_mps = p.wheel_radius_m * p.speed_per_volt * p.supply_volt;
-        for (field, value, above, below) in [
-            ("wheel_radius_m", p.wheel_radius_m, 0.0, MOST),
-            ("track_m", p.track_m, 0.0, MOST),
-            ("track_ratio", p.track_ratio, 1.0, MOST),
-            ("slide_lag_s", p.slide_lag_s, 0.0, MOST),
-            ("supply_volt", p.supply_volt, 0.0, MOST),
-            ("speed_per_volt", p.speed_per_volt, 0.0, MOST),
-            ("slip_s_per_m", p.slip_s_per_m, 0.0, 0.5 / fastest_mps),
-            ("drift_s", p.drift_s, 0.0, MOST),
-            ("motor_lag_s", p.motor_lag_s, 0.0, MOST),
-            ("viscous_volt_s", p.viscous_volt_s, 0.0, MOST),
-            ("break_away_volt", p.break_away_volt, 0.0, p.supply_volt),
-            ("coulomb_volt", p.coulomb_volt, 0.0, p.break_away_volt),
-            ("proportional_gain", p.proportional_gain, 0.0, MOST),
-            ("integral_gain", p.integral_gain, 0.0, MOST),
-        ] {
-            if !(value > above && value < below) {
-                return Err(RosbotError::OutOfRange { field, value, above, below });
-            }
-        }
-        Ok(Self { parameters, state: State::default(), since_tick_s: TICK_S })
+        parameters.check()?;
+        Ok(Self {
+            parameters,
+            motion: Motion::default(),
+            controllers: Default::default(),
+            since_tick_s: TICK_S,
+        })
     }
 
     /// Speeds of the right and the left wheels now (rad/s), as they are and not as their encoders
     /// measure them.
     pub fn wheel_speeds_radps(&self) -> [f64; 2] {
-        self.now().sides.map(|side| side.speed)
+        self.now().wheels.map(|wheel| wheel.speed_radps)
     }
 
     /// Encoder counts of the right and the left wheels now, 0 at the start, wrapping.
     pub fn encoder_counts(&self) -> [i32; 2] {
-        self.now().sides.map(|side| self.count(side.angle))
+        self.now().wheels.map(|wheel| self.count(wheel))
     }
 
-    /// Whole counts nearest to an angle (rad), modulo 2³²: rounded, not floored, so that forwards
-    /// and backwards are alike.
-    fn count(&self, angle: f64) -> i32 {
-        let counts = angle / TAU * f64::from(self.parameters.counts_per_turn.get());
+    /// Whole counts nearest to the angle of a wheel, modulo 2³²: rounded, not floored, so that
+    /// forwards and backwards are alike.
+    fn count(&self, wheel: Wheel) -> i32 {
+        let counts = wheel.angle_rad / TAU * f64::from(self.parameters.counts_per_turn.get());
         libm::round(counts) as i64 as i32
     }
 
-    fn now(&self) -> State {
+    fn now(&self) -> Motion {
         self.after_tick(self.since_tick_s.clamp(0.0, TICK_S))
     }
 
-    /// The state `t` seconds after the last controller tick, `t` up to [`TICK_S`].
-    fn after_tick(&self, t: f64) -> State {
-        let RosbotParameters { wheel_radius_m: r, slide_lag_s, .. } = self.parameters;
-        let State { sides, ground_mps: [right, left], pose: [x, y, phi] } = self.state;
-        let rate = |&[t, right, left, _, _, phi]: &[f64; 6]| {
-            let lag =
-                |side: Side, ground: f64| (r * self.turned(side, t).speed - ground) / slide_lag_s;
-            let [vx, vy, turn_rate] = self.twist([right, left], phi);
-            [1.0, lag(sides[0], right), lag(sides[1], left), vx, vy, turn_rate]
-        };
-        let [_, right, left, x, y, phi] = METHOD.integrate([0.0, right, left, x, y, phi], t, rate);
-        State {
-            sides: sides.map(|side| self.turned(side, t)),
-            ground_mps: [right, left],
-            pose: [x, y, phi],
-        }
-    }
-
-    /// (x', y', φ') for the ground speeds of the sides and the heading.
-    fn twist(&self, ground_mps: [f64; 2], phi: f64) -> [f64; 3] {
-        let p = &self.parameters;
-        let [right, left] = ground_mps.map(|g| g * (1.0 - p.slip_s_per_m * g.abs()));
-        let forward = (right + left) / 2.0;
-        let turn_rate = (right - left) / (p.track_ratio * p.track_m);
-        let sideways = -p.drift_s * forward * turn_rate;
-        let (sin, cos) = (libm::sin(phi), libm::cos(phi));
-        [forward * cos - sideways * sin, forward * sin + sideways * cos, turn_rate]
-    }
-
-    /// The wheels `t` seconds later under the same voltage.
-    fn turned(&self, mut side: Side, mut t: f64) -> Side {
-        let p = &self.parameters;
-        let damping = 1.0 + p.speed_per_volt * p.viscous_volt_s;
-        let lag_s = p.motor_lag_s / damping;
-        // Where the speed would end, for friction against this direction.
-        let volt = side.volt;
-        let end = |direction: f64| {
-            (volt - p.coulomb_volt.copysign(direction)) * p.speed_per_volt / damping
-        };
-        let approach = |side: Side, end: f64, t: f64| {
-            let gap = side.speed - end;
-            let fallen = -libm::expm1(-t / lag_s);
-            Side {
-                speed: side.speed - gap * fallen,
-                angle: side.angle + end * t + gap * lag_s * fallen,
-                ..side
-            }
-        };
-        if side.speed != 0.0 {
-            let end = end(side.speed);
-            let stop_s = if end * side.speed < 0.0 {
-                lag_s * libm::log1p(-side.speed / end)
-            } else {
-                f64::INFINITY
-            };
-            if t < stop_s {
-                return approach(side, end, t);
-            }
-            side = Side { speed: 0.0, ..approach(side, end, stop_s) };
-            t -= stop_s;
-        }
-        if volt.abs() <= p.break_away_volt { side } else { approach(side, end(volt), t) }
-    }
-
-    /// One controller tick.
-    fn control(&self, side: Side, command: f64) -> Side {
-        let p = &self.parameters;
-        let count = self.count(side.angle);
-        let turns = f64::from(count.wrapping_sub(side.count)) / f64::from(p.counts_per_turn.get());
-        let error = command - TAU * turns / TICK_S;
-        let wanted = p.proportional_gain * error + side.integral;
-        let volt = wanted.clamp(-p.supply_volt, p.supply_volt);
-        let winds_up = volt != wanted && error * wanted > 0.0;
-        let integral =
-            if winds_up { side.integral } else { side.integral + p.integral_gain * error * TICK_S };
-        Side { volt, integral, count, ..side }
+    /// The motion `t` seconds after the last controller tick, `t` up to [`TICK_S`].
+    fn after_tick(&self, t: f64) -> Motion {
+        let volts = self.controllers.map(|controller| controller.volt);
+        self.motion.after(&self.parameters, volts, [0.0; 2], t, METHOD)
     }
 }
 
@@ -346,7 +264,8 @@ impl Plant<3, 2> for Rosbot {
     }
 
     fn reset(&mut self) {
-        self.state = State::default();
+        self.motion = Motion::default();
+        self.controllers = Default::default();
         self.since_tick_s = TICK_S;
     }
 
@@ -354,15 +273,17 @@ impl Plant<3, 2> for Rosbot {
         if !(input.iter().all(|command| command.is_finite())
             && (0.0..f64::INFINITY).contains(&dt_s))
         {
-            self.state.pose = [f64::NAN; 3];
+            self.motion.pose = [f64::NAN; 3];
             return;
         }
         let mut left_s = dt_s;
         while left_s > 0.0 {
             if self.since_tick_s >= TICK_S - TICK_TOLERANCE_S {
-                self.state = self.after_tick(TICK_S);
-                let [right, left] = self.state.sides;
-                self.state.sides = [self.control(right, input[0]), self.control(left, input[1])];
+                self.motion = self.after_tick(TICK_S);
+                let counts = self.motion.wheels.map(|wheel| self.count(wheel));
+                for (side, controller) in self.controllers.iter_mut().enumerate() {
+                    *controller = controller.tick(&self.parameters, input[side], counts[side]);
+                }
                 self.since_tick_s -= TICK_S;
             }
             let to_tick_s = TICK_S - self.since_tick_s;
@@ -481,9 +402,9 @@ mod tests {
     fn bends_push_outwards_and_straight_lines_do_not() {
         let mut rosbot = at_rest();
         hold(&mut rosbot, CIRCLE, 10);
-        let state = rosbot.now();
-        let [vx, vy, turn_rate] = rosbot.twist(state.ground_mps, state.pose[2]);
-        let (sin, cos) = (libm::sin(state.pose[2]), libm::cos(state.pose[2]));
+        let motion = rosbot.now();
+        let [vx, vy, turn_rate] = rosbot.parameters.twist(motion.ground_mps, motion.pose[2]);
+        let (sin, cos) = (libm::sin(motion.pose[2]), libm::cos(motion.pose[2]));
         let (forward, sideways) = (vx * cos + vy * sin, vy * cos - vx * sin);
         assert!((sideways + 0.02 * forward * turn_rate).abs() < 1e-15);
         assert!((-0.018..-0.014).contains(&sideways), "{sideways}");
@@ -530,19 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn wheels_break_loose_only_above_the_dead_band() {
-        let rosbot = at_rest();
-        let after = |volt, speed| rosbot.turned(Side { volt, speed, ..Side::default() }, 0.01);
-        assert_eq!(after(0.9, 0.0), Side { volt: 0.9, ..Side::default() });
-        assert_eq!(after(-0.9, 0.0).speed, 0.0);
-        // Once loose, only the smaller Coulomb friction holds it back.
-        assert!((after(0.9 + 1e-9, 0.0).speed - 0.3 * 2.2 / 0.08 * 0.01).abs() < 0.01);
-        assert!(after(0.8, 0.1).speed > 0.1);
-        // A slow wheel stops within the 10 ms and stays.
-        let stopped = after(0.0, 0.1);
-        assert_eq!(stopped.speed, 0.0);
-        assert!(stopped.angle > 0.0 && stopped.angle < 0.1 * 0.01);
-
+    fn slow_commands_wait_for_the_integrator() {
         // A slow command moves nothing until the controller has integrated up to 0.9 V:
         // 0.7 · 0.5 + 9 · 0.5 · t = 0.9 at t = 0.122 s.
         let mut slow = at_rest();
@@ -553,35 +462,10 @@ mod tests {
     }
 
     #[test]
-    fn closed_solution_of_the_wheel_solves_its_equation() {
-        const STEPS: u32 = 200_000;
-        let rosbot = at_rest();
-        // Through a stop into the other direction, into rest, towards a standstill, and away.
-        for (speed, volt) in [(2.0, -6.0), (-2.0, 6.0), (0.3, 0.5), (4.0, 0.7), (0.0, -3.0)] {
-            let side = Side { speed, volt, ..Side::default() };
-            let h = 0.02 / f64::from(STEPS);
-            let (mut w, mut angle) = (speed, 0.0);
-            for _ in 0..STEPS {
-                let direction = if w == 0.0 { volt } else { w };
-                let loose = w != 0.0 || volt.abs() > 0.9;
-                let torque = 2.2 * (volt - 0.02 * w - 0.6_f64.copysign(direction)) - w;
-                let next = if loose { w + h / 0.08 * torque } else { 0.0 };
-                let next = if next * w < 0.0 { 0.0 } else { next };
-                angle += h * (w + next) / 2.0;
-                w = next;
-            }
-            let end = rosbot.turned(side, 0.02);
-            // Euler's error at steps of 0.1 µs and rates up to 200 rad/s².
-            assert!((end.speed - w).abs() < 1e-4, "{speed} {volt}: {} {w}", end.speed);
-            assert!((end.angle - angle).abs() < 1e-6, "{speed} {volt}: {} {angle}", end.angle);
-        }
-    }
-
-    #[test]
     fn encoders_count_the_turns_of_the_wheels() {
         let mut rosbot = at_rest();
         hold(&mut rosbot, [10.0, -5.0], 20);
-        let [right, left] = rosbot.now().sides.map(|side| side.angle);
+        let [right, left] = rosbot.now().wheels.map(|wheel| wheel.angle_rad);
         let counts = [right, left].map(|angle| libm::round(angle / TAU * 1632.0) as i32);
         assert_eq!(rosbot.encoder_counts(), counts);
         // 2 s at the commanded speeds, less what the start costs.
@@ -593,9 +477,9 @@ mod tests {
         let mut fresh = at_rest();
         let mut old = at_rest();
         let counts = i32::MAX - 200;
-        for side in &mut old.state.sides {
-            side.angle = f64::from(counts) / 1632.0 * TAU;
-            side.count = counts;
+        for side in 0..2 {
+            old.motion.wheels[side].angle_rad = f64::from(counts) / 1632.0 * TAU;
+            old.controllers[side].count = counts;
         }
         hold(&mut fresh, CIRCLE, 10);
         hold(&mut old, CIRCLE, 10);
@@ -747,7 +631,7 @@ mod tests {
                 prop_assert!(rosbot.wheel_speeds_radps().iter().all(|w| w.abs() <= fastest));
                 let [g_r, g_l] = rosbot.now().ground_mps;
                 prop_assert!(g_r.abs() <= 0.062 * fastest && g_l.abs() <= 0.062 * fastest);
-                prop_assert!(rosbot.state.sides.iter().all(|side| side.volt.abs() <= 12.0));
+                prop_assert!(rosbot.controllers.iter().all(|side| side.volt.abs() <= 12.0));
                 // Forward and, in the sharpest bend, sideways: at most 2 % · 13 rad/s of it.
                 let most = 0.062 * fastest * 1.04 * seconds + 1e-12;
                 prop_assert!(f64::hypot(x - x0, y - y0) <= most);

@@ -144,6 +144,23 @@ pub struct SoftLeg {
     state: [f64; STATES],
 }
 
+/// What is around the chambers of a leg: as it should be, but for a fault.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Surroundings {
+    /// Share of its pressure that each source reaches: the input pump, the exhaust pump. `None` for
+    /// a pump that is off: its line is shut and nothing flows.
+    pub sources: [Option<f64>; 2],
+    /// By how much faster than usual the bending and the extension chamber leak, from 1.
+    pub leaks: [f64; 2],
+}
+
+impl Default for Surroundings {
+    /// Both pumps run, nothing leaks more than usual.
+    fn default() -> Self {
+        Self { sources: [Some(1.0); 2], leaks: [1.0; 2] }
+    }
+}
+
 /// v, p, h, w of the bending chamber, then of the extension chamber.
 const STATES: usize = 2 * PER_CHAMBER;
 const PER_CHAMBER: usize = 4;
@@ -190,8 +207,13 @@ impl SoftLeg {
         [self.state[1], self.state[PER_CHAMBER + 1]]
     }
 
-    /// Signed opening a(u) that a held voltage leads to.
-    fn opening(&self, volt: f64) -> f64 {
+    /// Signed openings v of the valves now, from −1 to 1: above 0 towards the pressure line.
+    pub fn openings(&self) -> [f64; 2] {
+        [self.state[0], self.state[PER_CHAMBER]]
+    }
+
+    /// Signed opening a(u), from −1 to 1, that a held voltage (V) leads to.
+    pub fn opening(&self, volt: f64) -> f64 {
         let SoftLegParameters { dead_band_volt, full_open_volt, .. } = self.parameters;
         let size = (volt.abs() - dead_band_volt) / (full_open_volt - dead_band_volt);
         size.clamp(0.0, 1.0).copysign(volt)
@@ -203,18 +225,37 @@ impl SoftLeg {
         chamber: usize,
         [v, p, h, w]: [f64; PER_CHAMBER],
         opening: f64,
+        around: &Surroundings,
     ) -> [f64; PER_CHAMBER] {
         let c = &self.parameters;
-        let source = if v > 0.0 { c.supply_kpa } else { c.vacuum_kpa };
-        let difference = source - p;
-        let flow = difference / libm::sqrt(1.0 + difference.abs() / c.laminar_kpa);
-        let pressure_rate = c.flow_per_s[chamber] * v.abs() * flow - p / c.leak_s;
+        let (kpa, source) = if v > 0.0 {
+            (c.supply_kpa, around.sources[0])
+        } else {
+            (c.vacuum_kpa, around.sources[1])
+        };
+        let flow = source.map_or(0.0, |share| {
+            let difference = share * kpa - p;
+            difference / libm::sqrt(1.0 + difference.abs() / c.laminar_kpa)
+        });
+        let leak = p / c.leak_s * around.leaks[chamber];
+        let pressure_rate = c.flow_per_s[chamber] * v.abs() * flow - leak;
         [
             (opening - v) / c.valve_lag_s,
             pressure_rate,
             bouc_wen_rate(pressure_rate, h, c.hysteresis_kpa),
             (p - c.hysteresis_share * h - w) / c.viscous_lag_s[chamber],
         ]
+    }
+
+    /// Advances by `dt_s` seconds towards these signed openings of the valves, from −1 to 1.
+    pub fn step_towards(&mut self, openings: [f64; 2], around: &Surroundings, dt_s: f64) {
+        let [bend, extend] = openings;
+        let rate = |&[v1, p1, h1, w1, v2, p2, h2, w2]: &[f64; STATES]| {
+            let [a, b, c, d] = self.chamber_rate(0, [v1, p1, h1, w1], bend, around);
+            let [e, f, g, h] = self.chamber_rate(1, [v2, p2, h2, w2], extend, around);
+            [a, b, c, d, e, f, g, h]
+        };
+        self.state = self.method.integrate(self.state, dt_s, rate);
     }
 }
 
@@ -237,13 +278,8 @@ impl Plant<2, 2> for SoftLeg {
     }
 
     fn step(&mut self, input: &[f64; 2], dt_s: f64) {
-        let [bend, extend] = input.map(|volt| self.opening(volt));
-        let rate = |&[v1, p1, h1, w1, v2, p2, h2, w2]: &[f64; STATES]| {
-            let [a, b, c, d] = self.chamber_rate(0, [v1, p1, h1, w1], bend);
-            let [e, f, g, h] = self.chamber_rate(1, [v2, p2, h2, w2], extend);
-            [a, b, c, d, e, f, g, h]
-        };
-        self.state = self.method.integrate(self.state, dt_s, rate);
+        let openings = input.map(|volt| self.opening(volt));
+        self.step_towards(openings, &Surroundings::default(), dt_s);
     }
 
     fn observe(&self) -> [f64; 2] {
@@ -406,6 +442,33 @@ mod tests {
         let (coarse, fine) = (end(10), end(1000));
         // A hundredth of the 0.1 mm of measurement noise.
         assert!((0..2).all(|i| (coarse[i] - fine[i]).abs() < 1e-3));
+    }
+
+    #[test]
+    fn a_shut_line_supplies_nothing_and_the_leak_still_acts() {
+        let mut leg = leg();
+        hold(&mut leg, [12.0, -12.0], 1.0);
+        let off = Surroundings { sources: [None; 2], ..Default::default() };
+        let before = leg.pressures_kpa();
+        (0..20).for_each(|_| leg.step_towards([1.0, -1.0], &off, 0.05));
+        // One second of the leak's 10 s; RK4 is good to far below this.
+        let left = libm::exp(-0.1);
+        for (before, after) in before.into_iter().zip(leg.pressures_kpa()) {
+            assert!((after / before - left).abs() < 1e-9, "{before} {after}");
+        }
+        let leaking = Surroundings { leaks: [10.0, 1.0], ..off };
+        let before = leg.pressures_kpa();
+        (0..20).for_each(|_| leg.step_towards([1.0, -1.0], &leaking, 0.05));
+        assert!((leg.pressures_kpa()[0] / before[0] - libm::exp(-1.0)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_weak_pump_reaches_its_share() {
+        let mut leg = leg();
+        let weak = Surroundings { sources: [Some(0.5), Some(1.0)], ..Default::default() };
+        (0..1200).for_each(|_| leg.step_towards([1.0, 0.0], &weak, 0.05));
+        let [bending, _] = leg.pressures_kpa();
+        assert!((29.0..30.0).contains(&bending), "{bending}");
     }
 
     #[test]
