@@ -220,7 +220,7 @@ impl Dictionary {
 
     /// The blocks, each with its factors.
     #[inline]
-    pub fn blocks(&self) -> impl Iterator<Item = (Block, &[Factor])> {
+    pub fn blocks(&self) -> impl Iterator<Item = (Block, &[Factor])> + Clone {
         let mut rest: &[Factor] = &self.factors;
         self.blocks.iter().map(move |block| {
             let (own, others) =

@@ -38,6 +38,7 @@
 //! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
 //! | [`link`] | messages between host and controller over a serial line |
 //! | [`device`] | encoders, position sensors and the clock, as traits |
+//! | [`cost`] | instructions and bytes of a model, before it is flashed |
 //! | [`capacity`] | what there is room for |
 #![no_std]
 #![cfg_attr(
@@ -57,6 +58,7 @@ compile_error!("blobs are little-endian and are read in place");
 pub mod blob;
 pub mod capacity;
 pub mod control_loop;
+pub mod cost;
 pub mod device;
 pub mod dictionary;
 pub mod error_bounds;

@@ -1,16 +1,16 @@
 //! Counts the instructions of a step on the emulated Cortex-M4F for models of all kinds, and holds the
-//! trainer's cost table against them. `firmware-sim/cortex-m/measure` builds the image and runs it.
+//! cost table against them. `firmware-sim/cortex-m/measure` builds the image and runs it.
 
 use std::io::Write;
 use std::process::{Command, ExitCode};
 
 use firmware_core::blob;
 use firmware_core::capacity::MAX_OBSERVABLES;
+use firmware_core::cost::{self, Cost, Part};
 use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
 use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
-use trainer::cost::{self, Cost, Part};
 
 /// Random numbers: xorshift64*.
 struct Random(u64);

@@ -4,8 +4,8 @@
 use std::path::{Path, PathBuf};
 
 use firmware_core::blob::{Aligned, ParseError};
+use firmware_core::cost::Cost;
 use firmware_core::{Predictor, PredictorState, parse, parse_for};
-use trainer::cost::Cost;
 use trainer::edmd;
 use trainer::export::{coordinate, export};
 use trainer::recording::{Recording, Visitor};

@@ -10,7 +10,7 @@
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
 //! | [`score`], [`arx`], [`unicycle`] | rollouts over windows beside no motion, a linear ARX and a unicycle |
 //! | [`rollout`] | rollouts in f64 or f32, and their errors over test logs |
-//! | [`select`], [`library`], [`cost`] | the search for the best rollout that fits a controller |
+//! | [`select`], [`library`] | the search for the best rollout that fits a controller |
 //! | [`conformal`], [`cross_conformal`] | error bounds per state and step from held-out logs, or by leaving logs out |
 //! | [`stability`] | the model linearised along the data; where rollouts leave the data |
 //! | [`full_operator`], [`spectrum`] | the operator on the whole dictionary under held inputs; eigenvalues, eigenfunctions, modes |
@@ -24,7 +24,6 @@ pub mod arx;
 pub mod chain;
 pub mod conformal;
 pub mod convergence;
-pub mod cost;
 pub mod cross_conformal;
 pub mod edmd;
 pub mod edmd_dl;

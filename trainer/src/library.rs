@@ -14,9 +14,9 @@ use firmware_core::model::{
 };
 use firmware_core::{Number, SparseTerms};
 
-use crate::cost::Cost;
 use crate::robot::Robot;
 use crate::terms::Names;
+use firmware_core::cost::Cost;
 
 /// Terms of a library, the constant not counted.
 pub const MAX_LIBRARY: usize = 400;

@@ -32,7 +32,6 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::arx::MAX_LAGS;
-use crate::cost::Cost;
 use crate::library::{Chain, Frame, Term, library};
 use crate::report::hexadecimal;
 use crate::robot::{FitOptions, Robot, ScoreOptions};
@@ -43,6 +42,7 @@ use crate::sparse_fit::{
 pub use crate::sparse_fit::{MARGIN, Rejection};
 use crate::terms::{Names, robot_names};
 use crate::trajectory::{InMemory, Trajectories, Trajectory, collect_named};
+use firmware_core::cost::Cost;
 
 /// Frames that are searched after the screening.
 pub const FRAMES: usize = 2;
@@ -74,7 +74,7 @@ const GAIN: f64 = 1e-4;
 /// What a model may take, and how long the search.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
-    /// Instructions of one step, by [`cost`](crate::cost).
+    /// Instructions of one step, by [`cost`](firmware_core::cost).
     pub instructions: u32,
     /// Bytes of the blob.
     pub bytes: u32,

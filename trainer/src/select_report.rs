@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use firmware_core::model::{Symmetry, Target};
 
-use crate::cost::Cost;
 use crate::plot::{self, Axes, Chart, Series, Style};
 use crate::report::{grouped, significant};
 use crate::select::Selection;
 use crate::sparse_fit::{MARGIN, Rejection, SEARCH_WINDOWS};
+use firmware_core::cost::Cost;
 
 impl Selection {
     /// What was found, as text.

@@ -30,26 +30,26 @@ use crate::model::Model;
 pub struct Motor<P, D> {
     /// The duty is the size of the voltage as a share of the supply.
     pub pwm: P,
-    /// High: forwards.
-    pub forwards: D,
-    /// Which way the pin says, once it is known.
-    direction: Option<bool>,
+    /// High: backwards.
+    pub backwards: D,
+    /// What the pin says, once it is known.
+    reverse: Option<bool>,
 }
 
 impl<P: SetDutyCycle, D: OutputPin> Motor<P, D> {
     /// A motor whose pin has not been set yet.
-    pub fn new(pwm: P, forwards: D) -> Self {
-        Self { pwm, forwards, direction: None }
+    pub fn new(pwm: P, backwards: D) -> Self {
+        Self { pwm, backwards, reverse: None }
     }
 
     fn apply(&mut self, share: f32) -> Result<(), ActuatorError> {
-        let forwards = share > 0.0;
-        if share != 0.0 && self.direction != Some(forwards) {
+        let reverse = share < 0.0;
+        if share != 0.0 && self.reverse != Some(reverse) {
             // A bridge that is turned round under load short-circuits the motor's own voltage.
-            self.direction = None;
+            self.reverse = None;
             set_share(&mut self.pwm, 0.0)?;
-            self.forwards.set_state(forwards.into()).map_err(|_| ActuatorError)?;
-            self.direction = Some(forwards);
+            self.backwards.set_state(reverse.into()).map_err(|_| ActuatorError)?;
+            self.reverse = Some(reverse);
         }
         set_share(&mut self.pwm, share.abs())
     }

@@ -6,10 +6,10 @@
 //! succeeds and stays in range: the first step that leaves it also looks for the observable, and an
 //! angle that turns beyond half a turn takes a remainder.
 
-use firmware_core::SparseTerms;
-use firmware_core::blob;
-use firmware_core::dictionary::{Basis, Factor, Source};
-use firmware_core::model::{Space, State, Structure, Symmetry, Target};
+use crate::SparseTerms;
+use crate::blob;
+use crate::dictionary::{Basis, Factor, Source};
+use crate::model::{Space, State, Structure, Symmetry, Target};
 
 /// What one model takes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
@@ -66,11 +66,11 @@ impl Cost {
 /// }).unwrap();
 /// let terms: Vec<[u8; 2]> = (0..12).map(|function| [0, function]).collect();
 /// let terms = SparseTerms::new(structure.dictionary(), &terms).unwrap();
-/// assert_eq!(trainer::cost::instructions(&structure, Some(terms)), 875);
+/// assert_eq!(firmware_core::cost::instructions(&structure, Some(terms)), 875);
 /// ```
 pub fn instructions(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> u32 {
     let parts = parts(structure, terms);
-    parts.iter().map(|part| part.count as f32 * part.each).sum::<f32>().round() as u32
+    libm::roundf(parts.iter().map(|part| part.count as f32 * part.each).sum::<f32>()) as u32
 }
 
 /// Something that a step does.
@@ -94,9 +94,9 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
 
     // A sparse model has a factor per block, and no blocks for the kernel.
     let factors = structure.dictionary().blocks().flat_map(|(_, factors)| factors);
-    let factors: Vec<&Factor> = factors.filter(|_| !dense).collect();
-    let beyond = |f: &&Factor| usize::from(f.order) - 1;
-    let of_basis = |basis| factors.iter().copied().filter(move |f| f.basis == basis);
+    let factors = factors.filter(|_| !dense);
+    let beyond = |f: &&Factor| usize::from(f.order).saturating_sub(1);
+    let of_basis = |basis| factors.clone().filter(move |f| f.basis == basis);
     let fourier = of_basis(Basis::Fourier).filter(|f| f.order > 1);
     let powers = of_basis(Basis::Hermite).map(|f| beyond(&f)).sum();
     let fourier_harmonics = fourier.clone().map(|f| beyond(&f)).sum();
@@ -105,8 +105,9 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
     let later = if dense { 0 } else { outputs.saturating_sub(4) };
 
     let blocks = structure.dictionary().blocks().filter(|_| dense);
-    let blocks: Vec<(usize, usize)> =
-        blocks.map(|(_, own)| (own.len(), own.iter().map(|f| f.radix()).product())).collect();
+    let blocks =
+        blocks.map(|(_, own)| (own.len(), own.iter().map(|f| f.radix()).product::<usize>()));
+    let block_count = blocks.clone().count();
 
     let of =
         |kind: &dyn Fn(&State<'_>) -> bool| structure.states().iter().filter(|s| kind(s)).count();
@@ -122,7 +123,7 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
     let turned = turned.count();
     let angles = states.filter(|(i, s)| {
         let [low, high] = s.limit;
-        let limited = low > -std::f32::consts::PI || high < std::f32::consts::PI;
+        let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
         absolute(s) && (limited || observed(Source::Increment(*i)))
     });
     let angles = angles.count();
@@ -169,14 +170,14 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
             usize::from(matches!(structure.symmetry(), Symmetry::Se2 { .. })),
             35.1,
         ),
-        part("dense block", blocks.len(), 341.7),
-        part("factor of a dense block", blocks.iter().map(|(factors, _)| factors).sum(), 74.3),
-        part("dense block and output", blocks.len() * outputs, 23.3),
+        part("dense block", block_count, 341.7),
+        part("factor of a dense block", blocks.clone().map(|(factors, _)| factors).sum(), 74.3),
+        part("dense block and output", block_count * outputs, 23.3),
         part(
             "dense coefficient of the first 16 of a block",
-            blocks.iter().map(|(_, size)| size.min(&16) * outputs).sum(),
+            blocks.clone().map(|(_, size)| size.min(16) * outputs).sum(),
             14.2,
         ),
-        part("dense coefficient", blocks.iter().map(|(_, size)| size * outputs).sum(), 6.8),
+        part("dense coefficient", blocks.map(|(_, size)| size * outputs).sum(), 6.8),
     ]
 }
