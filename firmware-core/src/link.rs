@@ -29,7 +29,7 @@ use crate::control_loop::Command;
 use crate::control_loop::telemetry::{Frame, Frames};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
-/// room for takes 197 bytes.
+/// room for takes 199 bytes.
 pub const MAX_FRAME: usize = 256;
 
 /// What goes over the line.
@@ -258,6 +258,7 @@ mod tests {
             time_us: u64::MAX,
             mode: crate::control_loop::Mode::Safe,
             alarms: crate::control_loop::Alarms::SAFE,
+            noticed: crate::control_loop::Alarms::SAFE,
             applied: numbers.into_iter().take(MAX_INPUTS).collect(),
             measured: numbers.into_iter().collect(),
             predicted: numbers.into_iter().collect(),
@@ -278,7 +279,7 @@ mod tests {
     fn the_largest_frame_has_room() {
         let mut out = [0; MAX_FRAME];
         let length = encode(&full(), &mut out).unwrap();
-        assert_eq!(length, 197, "see MAX_FRAME");
+        assert_eq!(length, 199, "see MAX_FRAME");
         assert_eq!(receive(&out[..length]), [Received::Message(full())]);
     }
 

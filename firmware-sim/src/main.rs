@@ -26,6 +26,7 @@ enum Command {
     ///
     /// ROBOT is one of
     ///   rosbot        differential drive: x, y, phi; wheel speeds N(0, 9²) within ±32 rad/s; 10 Hz
+    ///   skid-rosbot   invented skid-steered ROSbot: as rosbot; wheel speeds within ±16 rad/s, held 0.3 s to 2 s
     ///   two-link-arm  two joints: angles and rates; torques N(0, 1) Nm; 100 Hz
     ///   soft-leg      invented soft pneumatic leg: tip y, z; valve voltages held 0.2 s to 1 s; 20 Hz
     ///
@@ -68,7 +69,7 @@ enum LogSet {
 
 #[derive(Args)]
 struct RobotLogs {
-    /// rosbot, two-link-arm or soft-leg
+    /// rosbot, skid-rosbot, two-link-arm or soft-leg
     robot: Robot,
     /// Number of trajectories
     #[arg(long, value_name = "N")]
@@ -84,7 +85,7 @@ struct RobotLogs {
     out: PathBuf,
     /// Add measurement noise of SCALE times the usual size (1 if SCALE is left out)
     ///
-    /// Usual sizes: rosbot 1 mm and 2 mrad, two-link-arm 0.2 mrad and 5 mrad/s, soft-leg 0.1 mm.
+    /// Usual sizes: rosbot and skid-rosbot 1 mm and 2 mrad, two-link-arm 0.2 mrad and 5 mrad/s, soft-leg 0.1 mm.
     #[arg(long, value_name = "SCALE", num_args = 0..=1, default_value = "0", default_missing_value = "1", hide_default_value = true)]
     noise: f64,
     /// exact (rosbot only), rk4 or euler (not soft-leg); rk4:N or euler:N for N steps per sample

@@ -298,8 +298,9 @@ where
         self.ticks = self.ticks.saturating_add(1);
         if let Some(frame) = frame {
             let worst_tick_us = self.supervisor.take_worst_us();
+            let noticed = self.supervisor.take_recent();
             let (mode, alarms) = (self.supervisor.mode(), self.supervisor.alarms());
-            self.telemetry.send(Frame { mode, alarms, worst_tick_us, ..frame });
+            self.telemetry.send(Frame { mode, alarms, noticed, worst_tick_us, ..frame });
         }
         self.supervisor.mode()
     }

@@ -177,8 +177,9 @@ where
             let _ = self.actuators.stop();
         }
         let worst_tick_us = self.supervisor.take_worst_us();
+        let noticed = self.supervisor.take_recent();
         let (mode, alarms) = (self.supervisor.mode(), self.supervisor.alarms());
-        self.telemetry.send(Frame { mode, alarms, worst_tick_us, ..frame });
+        self.telemetry.send(Frame { mode, alarms, noticed, worst_tick_us, ..frame });
         mode
     }
 

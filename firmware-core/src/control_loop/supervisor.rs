@@ -196,6 +196,8 @@ pub struct Supervisor {
     timing: Timing,
     mode: Mode,
     alarms: Alarms,
+    /// Those noticed since they were last taken.
+    recent: Alarms,
     /// When the last tick began.
     began_us: Option<u64>,
     /// When the host was last heard, by the clock of the ticks.
@@ -212,6 +214,7 @@ impl Supervisor {
             timing,
             mode: Mode::Idle,
             alarms: Alarms::none(),
+            recent: Alarms::none(),
             began_us: None,
             heard_us: 0,
             silent_ticks: 0,
@@ -267,6 +270,11 @@ impl Supervisor {
         core::mem::take(&mut self.worst_us)
     }
 
+    /// What was noticed since the last call.
+    pub fn take_recent(&mut self) -> Alarms {
+        core::mem::take(&mut self.recent)
+    }
+
     /// The host is alive.
     pub fn heard(&mut self) {
         self.heard_us = self.began_us.unwrap_or(0);
@@ -300,6 +308,7 @@ impl Supervisor {
     /// Something was noticed.
     pub fn raise(&mut self, alarms: Alarms) {
         self.alarms |= alarms;
+        self.recent |= alarms;
         if self.mode == Mode::Running && alarms.intersects(Alarms::SAFE) {
             self.mode = Mode::Safe;
         }

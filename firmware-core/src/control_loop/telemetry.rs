@@ -23,6 +23,8 @@ pub struct Frame {
     pub mode: Mode,
     /// What was noticed since the last start or reset.
     pub alarms: Alarms,
+    /// What was noticed since the frame before.
+    pub noticed: Alarms,
     /// Mean inputs that acted since the sample before, in the model's order and units.
     pub applied: Vec<f32, MAX_INPUTS>,
     /// Coordinates as measured now, in the model's order and units; empty without a measurement that was
