@@ -19,7 +19,7 @@
 //! | `silence` | what the host sends is lost | | probability per write |
 //! | `brown-out` | the microcontroller's supply dips | | share that is lost |
 //!
-//! Without a unit, all units are hit. Sensors, encoders and the host's line are wrapped
+//! Without a unit, all units are hit. A fault of the plant counts once per unit and tick. Sensors, encoders and the host's line are wrapped
 //! ([`faulty`](crate::faulty)); the plant's faults act through the `apply` of a
 //! [`bench`](mod@crate::bench); ticks and the microcontroller's supply are the business of whoever
 //! runs the loop, who asks [`Faults::late_by_us`] and [`Faults::act`].

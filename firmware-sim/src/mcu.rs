@@ -14,12 +14,14 @@
 //! | [`pwm`], [`pin`] | the outputs |
 //! | [`encoder`], [`position_sensor`], [`adc`] | the inputs |
 //! | [`uart`] | a serial line with its times, losses and overruns |
+//! | [`flash`] | NOR flash with unequal sectors and failing power |
 //! | [`power`] | the supply and its brown-out detector |
 
 pub mod adc;
 pub mod board;
 pub mod clock;
 pub mod encoder;
+pub mod flash;
 pub mod misuse;
 pub mod pin;
 pub mod position_sensor;
@@ -32,6 +34,7 @@ pub use adc::Adc;
 pub use board::Board;
 pub use clock::VirtualClock;
 pub use encoder::Encoder;
+pub use flash::Flash;
 pub use misuse::MisuseLog;
 pub use pin::Pin;
 pub use position_sensor::MotionCapture;
