@@ -12,7 +12,7 @@
 //! | `stuck-valve` | the valve stays at the opening that it has | chamber: 0 bending, 1 extension | probability per tick |
 //! | `open-valve` | the valve is open to the selected line, whatever its voltage | chamber | how far, 1 is fully |
 //! | `leak` | the chamber leaks faster | chamber | i: by 1 + 99 i |
-//! | `pump` | the pump reaches less pressure | 0 input, 1 exhaust | share that is lost |
+//! | `pump` | the pump reaches less pressure | 0 input, 1 exhaust | share that is lost; with 1 its line is open to the outside |
 //! | `slip` | the wheels lose way | side | share that is lost |
 //! | `sag` | the battery has less voltage | | share that is lost |
 //! | `late-tick` | ticks of the loop come late | | most, in periods; uniform from 0 |
