@@ -12,14 +12,14 @@
 //! | `stuck-valve` | the valve stays at the opening that it has | chamber: 0 bending, 1 extension | probability per tick |
 //! | `open-valve` | the valve is open to the selected line, whatever its voltage | chamber | how far, 1 is fully |
 //! | `leak` | the chamber leaks faster | chamber | i: by 1 + 99 i |
-//! | `pump` | the pump reaches less pressure | 0 input, 1 exhaust | share that is lost |
+//! | `pump` | the pump reaches less pressure | 0 input, 1 exhaust | share that is lost; with 1 its line is open to the outside |
 //! | `slip` | the wheels lose way | side | share that is lost |
 //! | `sag` | the battery has less voltage | | share that is lost |
 //! | `late-tick` | ticks of the loop come late | | most, in periods; uniform from 0 |
 //! | `silence` | what the host sends is lost | | probability per write |
 //! | `brown-out` | the microcontroller's supply dips | | share that is lost |
 //!
-//! Without a unit, all units are hit. Sensors, encoders and the host's line are wrapped
+//! Without a unit, all units are hit. A fault of the plant counts once per unit and tick. Sensors, encoders and the host's line are wrapped
 //! ([`faulty`](crate::faulty)); the plant's faults act through the `apply` of a
 //! [`bench`](mod@crate::bench); ticks and the microcontroller's supply are the business of whoever
 //! runs the loop, who asks [`Faults::late_by_us`] and [`Faults::act`].

@@ -14,7 +14,7 @@
 //! | [`arm`] | two-revolute-joint arm, the paper's system (arm) |
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
 //! | [`bench`](mod@bench) | ROSbot and soft leg, wired to a simulated microcontroller |
-//! | [`mcu`] | the simulated microcontroller: clock, outputs, sensors, misuse |
+//! | [`mcu`] | the simulated microcontroller: clock, peripherals, flash, misuse |
 //! | [`fault`], [`faulty`] | what goes wrong and when; devices that show it |
 //! | [`record`] | logs as CSV, one file per trajectory |
 //! | [`paper`] | the logs that repeat the paper's experiments |

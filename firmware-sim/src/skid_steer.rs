@@ -78,7 +78,7 @@ pub struct SkidSteer {
 }
 
 impl SkidSteer {
-    /// Of the body. The fastest lag is 30 ms: steps of 10 ms are good to micrometres.
+    /// Of the body. Its lag is 30 ms: one step per 10 ms stays within a tenth of the sensor's noise.
     const METHOD: Numerical = Numerical::Rk4 { substeps: NonZeroU32::MIN };
 
     /// A robot at rest at the origin.

@@ -2,7 +2,7 @@
 //!
 //! | device | where |
 //! |---|---|
-//! | PWM right, left | timer 1, channels 1 and 2, 18 kHz: voltage = share of full duty × supply |
+//! | PWM right, left | timer 3, channels 1 and 2, 18 kHz: voltage = share of full duty × supply |
 //! | direction right, left | pins `dir_right`, `dir_left`: high is backwards |
 //! | encoders right, left | 1632 counts per turn, as [`RosbotParameters`] say |
 //! | pose | motion capture of x (m), y (m), φ (rad) |
@@ -20,7 +20,7 @@ use crate::skid_steer::{Motion, SkidSteer};
 pub const PWM_HZ: u32 = 18_000;
 /// Longest step of the plant (ns), the one for which [`SkidSteer`] promises its accuracy.
 const STEP_NS: u64 = 10_000_000;
-const TIMER: u8 = 1;
+const TIMER: u8 = 3;
 const DIRECTION_PINS: [&str; 2] = ["dir_right", "dir_left"];
 
 /// What the firmware of a ROSbot gets; sides are ordered right, left.

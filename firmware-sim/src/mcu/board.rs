@@ -71,14 +71,14 @@ pub enum ResetCause {
 /// use firmware_sim::mcu::{Board, VirtualClock};
 ///
 /// let mut board = Board::new(&VirtualClock::new());
-/// let share = board.pwm_wire(1, 2);
-/// let mut pwm = board.pwm(1, 2, 18_000)?;
+/// let share = board.pwm_wire(3, 2);
+/// let mut pwm = board.pwm(3, 2, 18_000)?;
 /// assert_eq!(pwm.max_duty_cycle(), 4666); // 84 MHz / 18 kHz
 /// pwm.set_duty_cycle(2333)?;
 /// assert_eq!(share.get(), 0.5);
 ///
-/// let error = board.pwm(1, 3, 20_000).unwrap_err();
-/// assert_eq!(error.to_string(), "timer 1 runs at 18000 Hz and cannot run at 20000 Hz too");
+/// let error = board.pwm(3, 3, 20_000).unwrap_err();
+/// assert_eq!(error.to_string(), "timer 3 runs at 18000 Hz and cannot run at 20000 Hz too");
 /// assert_eq!(board.misuse().unwrap().count, 1);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
@@ -105,7 +105,7 @@ struct Output<T: Copy> {
 pub(crate) type Resets = Rc<Cell<u32>>;
 
 impl Board {
-    /// Clock of the timers of an STM32F407 on its slower bus (Hz).
+    /// Clock of timers 2 to 7 and 12 to 14 of an STM32F407 (Hz); here it is that of all timers.
     pub const TIMER_CLOCK_HZ: u32 = 84_000_000;
 
     /// A board with all outputs low.
