@@ -32,6 +32,12 @@ pub trait PositionSensor<const N: usize> {
     /// # Errors
     /// When the sensor cannot be read.
     fn measure(&mut self) -> Result<Option<[f32; N]>, Self::Error>;
+
+    /// How old the last measurement was when it was handed out (µs), of a sensor that stamps its
+    /// measurements with the time; a loop does not use one that belongs to an earlier sample.
+    fn age_us(&self) -> u32 {
+        0
+    }
 }
 
 /// A clock that never goes back.

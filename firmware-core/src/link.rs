@@ -1,7 +1,7 @@
 //! Messages between host and controller over a serial line.
 //!
 //! A message is encoded with postcard, followed by its CRC-32 (ISO-HDLC, as in the blob, little-endian),
-//! the whole stuffed with COBS (Cheshire & Baker 1999, "Consistent overhead byte stuffing") and ended by a
+//! the whole stuffed with COBS (Cheshire & Baker 2049, "Consistent overhead byte stuffing") and ended by a
 //! zero byte:
 //!
 //! ```text
@@ -29,7 +29,7 @@ use crate::control_loop::Command;
 use crate::control_loop::telemetry::{Frame, Frames};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
-/// room for takes 199 bytes.
+/// room for takes 204 bytes.
 pub const MAX_FRAME: usize = 256;
 
 /// What goes over the line.
@@ -264,6 +264,7 @@ mod tests {
             predicted: numbers.into_iter().collect(),
             residual: numbers.into_iter().collect(),
             steps: u32::MAX,
+            bound_steps: u32::MAX,
             ahead: numbers.into_iter().collect(),
             worst_tick_us: u32::MAX,
             dropped: u32::MAX,
@@ -279,7 +280,7 @@ mod tests {
     fn the_largest_frame_has_room() {
         let mut out = [0; MAX_FRAME];
         let length = encode(&full(), &mut out).unwrap();
-        assert_eq!(length, 199, "see MAX_FRAME");
+        assert_eq!(length, 204, "see MAX_FRAME");
         assert_eq!(receive(&out[..length]), [Received::Message(full())]);
     }
 

@@ -237,6 +237,16 @@ impl Fault {
         self.unit
     }
 
+    /// When it begins (s).
+    pub fn from_s(&self) -> f64 {
+        self.from_s
+    }
+
+    /// When it ends (s).
+    pub fn until_s(&self) -> f64 {
+        self.until_s
+    }
+
     /// Whether it is active at a time (s).
     pub fn is_active(&self, t_s: f64) -> bool {
         (self.from_s..self.until_s).contains(&t_s)

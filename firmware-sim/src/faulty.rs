@@ -34,14 +34,22 @@ pub struct FaultySensor<D, const N: usize> {
     faults: Faults,
     spike: [f32; N],
     last: Option<[f32; N]>,
-    /// Measurements on their way, each with the time at which it arrives (µs).
-    delayed: VecDeque<(u64, [f32; N])>,
+    /// Measurements on their way, each with the times of its measurement and its arrival (µs).
+    delayed: VecDeque<(u64, u64, [f32; N])>,
+    age_us: u32,
 }
 
 impl<D, const N: usize> FaultySensor<D, N> {
     /// Wraps a sensor. A spike of intensity 1 adds or takes `spike`, in the units of the coordinates.
     pub fn new(device: D, faults: &Faults, spike: [f32; N]) -> Self {
-        Self { device, faults: faults.clone(), spike, last: None, delayed: VecDeque::new() }
+        Self {
+            device,
+            faults: faults.clone(),
+            spike,
+            last: None,
+            delayed: VecDeque::new(),
+            age_us: 0,
+        }
     }
 
     /// What becomes of a measurement before it sets out.
@@ -88,11 +96,19 @@ impl<D: PositionSensor<N>, const N: usize> PositionSensor<N> for FaultySensor<D,
         let now_us = self.faults.clock().now_us();
         if let Some(measured) = measured {
             let delay_s = self.faults.act(FaultKind::Delay, None).unwrap_or(0.0);
-            self.delayed.push_back((now_us + (delay_s * 1e6) as u64, measured));
+            self.delayed.push_back((now_us, now_us + (delay_s * 1e6) as u64, measured));
         }
         // The newest that is there; what it overtook is of no use any more.
-        let arrived = self.delayed.iter().rposition(|(arrival_us, _)| *arrival_us <= now_us);
-        Ok(arrived.and_then(|last| self.delayed.drain(..=last).next_back()).map(|(_, m)| m))
+        let arrived = self.delayed.iter().rposition(|(_, arrival_us, _)| *arrival_us <= now_us);
+        let newest = arrived.and_then(|last| self.delayed.drain(..=last).next_back());
+        Ok(newest.map(|(measured_us, _, measured)| {
+            self.age_us = u32::try_from(now_us - measured_us).unwrap_or(u32::MAX);
+            measured
+        }))
+    }
+
+    fn age_us(&self) -> u32 {
+        self.age_us.saturating_add(self.device.age_us())
     }
 }
 

@@ -16,6 +16,7 @@
 //! | [`bench`](mod@bench) | ROSbot and soft leg, wired to a simulated microcontroller |
 //! | [`mcu`] | the simulated microcontroller: clock, peripherals, flash, misuse |
 //! | [`fault`], [`faulty`] | what goes wrong and when; devices that show it |
+//! | [`run`] | the firmware on a simulated controller: scenarios, verdicts, plots |
 //! | [`record`] | logs as CSV, one file per trajectory |
 //! | [`paper`] | the logs that repeat the paper's experiments |
 //!
@@ -58,6 +59,7 @@ pub mod paper;
 pub mod plant;
 pub mod record;
 pub mod rosbot;
+pub mod run;
 mod sinc;
 pub mod skid_steer;
 pub mod soft_leg;

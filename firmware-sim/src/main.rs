@@ -1,13 +1,23 @@
 //! The command `firmware-sim`.
 
 use clap::{Args, Parser, Subcommand};
+use firmware_core::model::Structure;
 use firmware_sim::Integrator;
+use firmware_sim::fault::Fault;
 use firmware_sim::paper::PaperLogs;
 use firmware_sim::record::{Recording, Robot, Settings};
+use firmware_sim::run;
+use firmware_sim::run::figure::Figure;
+use firmware_sim::run::live::Live;
+use firmware_sim::run::log::Logger;
+use firmware_sim::run::scenario::{FaultText, Scenario};
+use firmware_sim::run::summary::Summary;
+use firmware_sim::run::sweep;
 use std::error::Error;
-use std::io::Write;
-use std::path::PathBuf;
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::Duration;
 
 /// Simulated robots.
 #[derive(Parser)]
@@ -26,7 +36,6 @@ enum Command {
     ///
     /// ROBOT is one of
     ///   rosbot        differential drive: x, y, phi; wheel speeds N(0, 9²) within ±32 rad/s; 10 Hz
-    ///   skid-rosbot   invented skid-steered ROSbot: as rosbot; wheel speeds within ±16 rad/s, held 0.3 s to 2 s
     ///   two-link-arm  two joints: angles and rates; torques N(0, 1) Nm; 100 Hz
     ///   soft-leg      invented soft pneumatic leg: tip y, z; valve voltages held 0.2 s to 1 s; 20 Hz
     ///
@@ -44,6 +53,76 @@ enum Command {
         #[command(flatten)]
         robot: Option<RobotLogs>,
     },
+    Run(RunArgs),
+    Sweep(SweepArgs),
+}
+
+/// Runs a model's robot with every fault at several intensities and compares what comes of them with what
+/// is expected.
+///
+/// Each case is run once per seed: 20 s of random driving, 30 s of the fault. A fault is *survived* when the
+/// true motion stays within the prediction's error bounds, *flagged* when the loop noticed it and went on,
+/// *safe* when it switched everything off, *MISSED* when the motion left the bounds and nothing noticed.
+/// Times are the longest over the seeds, shares the least. Exits with an error when a case is worse than
+/// expected.
+#[derive(Args)]
+#[command(verbatim_doc_comment)]
+struct SweepArgs {
+    /// The blob
+    model: PathBuf,
+    /// Runs per case
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    seeds: u64,
+}
+
+/// Runs a model's robot: the firmware's own control loop on a simulated controller, with its serial line,
+/// faults and deadlines, in virtual time.
+///
+/// The model says which robot: [x, y, phi] from [omega_r, omega_l] is the ROSbot, [y, z] from
+/// [bending, extension] the soft leg. Exits with an error when an actuator was driven out of turn, when a
+/// fault was neither survived nor noticed, or when the firmware misused the hardware.
+#[derive(Args)]
+#[command(verbatim_doc_comment)]
+struct RunArgs {
+    /// The blob
+    model: PathBuf,
+    /// Scenario, a TOML file [default: a minute of random driving]
+    #[arg(long, value_name = "FILE")]
+    scenario: Option<PathBuf>,
+    /// Virtual time, instead of the scenario's
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Faults, beside the scenario's: KIND[:UNIT]@FROM..UNTIL=INTENSITY, such as slip:1@20..40=0.5
+    ///
+    /// Kinds: dropout, nan, freeze, spike, delay, missed-counts, wrap, stuck-valve, open-valve, leak, pump,
+    /// slip, sag, late-tick, silence, brown-out; times in seconds; intensities above 0 up to 1, whose
+    /// meaning is in the documentation of firmware_sim::fault.
+    #[arg(long, value_name = "FAULT", value_delimiter = ',')]
+    faults: Vec<Fault>,
+    /// Seed of sensors, faults and random commands
+    #[arg(long, value_name = "K", default_value_t = 1)]
+    seed: u64,
+    /// Print JSON instead of a table
+    #[arg(long)]
+    json: bool,
+    /// Show the robot in the terminal while it runs
+    #[arg(long, conflicts_with = "json")]
+    live: bool,
+    /// With --live: times as fast as reality; 0 for as fast as it goes
+    #[arg(long, value_name = "X", default_value_t = 1.0, requires = "live")]
+    speed: f64,
+    /// Write a plot of predicted beside measured, SVG
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
+    /// Write the telemetry as logs for the trainer to this folder
+    #[arg(long, value_name = "DIR")]
+    log: Option<PathBuf>,
+    /// Start a new log after this time, for the trainer's whole-trajectory cross-validation
+    #[arg(long, value_name = "S", requires = "log", value_parser = clap::value_parser!(u32).range(1..))]
+    log_seconds: Option<u32>,
+    /// Replace the logs of an earlier run
+    #[arg(long, requires = "log")]
+    overwrite: bool,
 }
 
 #[derive(Subcommand)]
@@ -69,7 +148,7 @@ enum LogSet {
 
 #[derive(Args)]
 struct RobotLogs {
-    /// rosbot, skid-rosbot, two-link-arm or soft-leg
+    /// rosbot, two-link-arm or soft-leg
     robot: Robot,
     /// Number of trajectories
     #[arg(long, value_name = "N")]
@@ -85,7 +164,7 @@ struct RobotLogs {
     out: PathBuf,
     /// Add measurement noise of SCALE times the usual size (1 if SCALE is left out)
     ///
-    /// Usual sizes: rosbot and skid-rosbot 1 mm and 2 mrad, two-link-arm 0.2 mrad and 5 mrad/s, soft-leg 0.1 mm.
+    /// Usual sizes: rosbot 1 mm and 2 mrad, two-link-arm 0.2 mrad and 5 mrad/s, soft-leg 0.1 mm.
     #[arg(long, value_name = "SCALE", num_args = 0..=1, default_value = "0", default_missing_value = "1", hide_default_value = true)]
     noise: f64,
     /// exact (rosbot only), rk4 or euler (not soft-leg); rk4:N or euler:N for N steps per sample
@@ -120,8 +199,133 @@ fn main() -> ExitCode {
     }
 }
 
+fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
+    let named = |error: &dyn std::fmt::Display| format!("{}: {error}", args.model.display());
+    let blob = run::Blob::read(&args.model)?;
+    let model = blob.model().map_err(|e| named(&e))?;
+    let structure = model.structure();
+    let scenario = scenario(args, structure).map_err(|e| e.to_string())?;
+    let mut logger = args
+        .log
+        .as_ref()
+        .map(|dir| Logger::new(dir, structure, args.log_seconds, args.overwrite))
+        .transpose()?;
+    let states = structure.states().iter().map(|s| (s.name.to_owned(), s.unit.to_owned()));
+    let states: Vec<(String, String)> = states.collect();
+    let name = args.scenario.as_ref().and_then(|path| path.file_stem()).unwrap_or_default();
+    let title = match name.to_string_lossy() {
+        name if name.is_empty() => format!("{}: random driving", structure.robot()),
+        name => format!("{}: {name}", structure.robot()),
+    };
+    let faults = scenario.faults.iter().map(|fault| fault.0).collect();
+    let mut figure = args
+        .plot
+        .as_ref()
+        .map(|_| Figure::new(title, states.clone(), model.error_bounds(), faults));
+    let mut live = args.live.then(|| (Live::new(), std::time::Instant::now()));
+    if args.live {
+        // Clears the screen; every picture begins at its top.
+        write!(std::io::stdout(), "\x1b[2J")?;
+    }
+    let summary = run::run(&model, &scenario, args.seed, &mut |seen| {
+        if let Some(logger) = &mut logger {
+            logger.frame(seen.frame)?;
+        }
+        if let Some(figure) = &mut figure {
+            figure.sample(seen);
+        }
+        if let Some((live, began)) = &mut live {
+            let mut out = std::io::stdout().lock();
+            write!(out, "\x1b[H{}", live.picture(seen, &states))?;
+            out.flush()?;
+            if args.speed > 0.0 {
+                let due = Duration::from_secs_f64(seen.frame.time_us as f64 * 1e-6 / args.speed);
+                std::thread::sleep(due.saturating_sub(began.elapsed()));
+            }
+        }
+        Ok(())
+    });
+    let summary = summary.map_err(|e| named(&e))?;
+    if let (Some(logger), Some(dir)) = (&mut logger, &args.log) {
+        logger.finish()?;
+        writeln!(std::io::stderr(), "{} logs in {}", logger.episodes(), dir.display())?;
+    }
+    if let (Some(figure), Some(path)) = (&figure, &args.plot) {
+        write_whole(path, figure.svg()?.as_bytes())?;
+    }
+    print_summary(args, &summary)?;
+    if summary.holds() {
+        Ok(())
+    } else {
+        Err("a fault was missed, or an actuator was driven out of turn: see the table".into())
+    }
+}
+
+/// Writes a file whole or not at all.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Box<dyn Error>> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let failed = |e: &dyn std::fmt::Display| format!("{}: cannot be written: {e}", path.display());
+    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(|e| failed(&e))?;
+    file.write_all(bytes).map_err(|e| failed(&e))?;
+    file.persist(path).map_err(|e| failed(&e))?;
+    Ok(())
+}
+
+fn sweep_model(args: &SweepArgs) -> Result<(), Box<dyn Error>> {
+    let named = |error: &dyn std::fmt::Display| format!("{}: {error}", args.model.display());
+    let blob = run::Blob::read(&args.model)?;
+    let model = blob.model().map_err(|e| named(&e))?;
+    let terminal = std::io::stderr().is_terminal();
+    let rows = sweep::sweep(&model, args.seeds, &mut |done, all| {
+        if terminal {
+            let end = if done == all { "\r\x1b[K" } else { "" };
+            let _ = write!(std::io::stderr(), "\r{done} of {all} cases{end}");
+        }
+    });
+    let rows = rows.map_err(|e| named(&e))?;
+    let runs: usize = rows.iter().map(|row| row.found.len()).sum();
+    write!(
+        std::io::stdout(),
+        "{}: {} cases, {runs} runs\n{}",
+        args.model.display(),
+        rows.len(),
+        sweep::table(&rows)
+    )?;
+    match rows.iter().filter(|row| !row.holds()).count() {
+        0 => Ok(()),
+        worse => Err(format!("{worse} cases are worse than expected").into()),
+    }
+}
+
+fn scenario(args: &RunArgs, structure: &Structure<'_>) -> Result<Scenario, Box<dyn Error>> {
+    let robot = run::Robot::of(structure)?;
+    let mut scenario = match &args.scenario {
+        Some(path) => Scenario::load(path, structure.inputs().len())?,
+        None => Scenario::random(robot.limit()),
+    };
+    if let Some(seconds) = args.seconds {
+        scenario.seconds = seconds;
+    }
+    scenario.faults.extend(args.faults.iter().copied().map(FaultText));
+    scenario.check(structure.inputs().len())?;
+    Ok(scenario)
+}
+
+fn print_summary(args: &RunArgs, summary: &Summary) -> Result<(), Box<dyn Error>> {
+    let mut out = std::io::stdout();
+    if args.json {
+        serde_json::to_writer_pretty(&mut out, summary)?;
+        writeln!(out)?;
+    } else {
+        write!(out, "{} on the simulated controller\n{}", args.model.display(), summary.text())?;
+    }
+    Ok(())
+}
+
 fn run(arguments: Arguments) -> Result<(), Box<dyn Error>> {
     match arguments.command {
+        Command::Run(args) => run_model(&args)?,
+        Command::Sweep(args) => sweep_model(&args)?,
         Command::Record { set: Some(LogSet::Paper { seed, out, overwrite }), .. } => {
             let logs = PaperLogs::new(seed);
             logs.write(&out, overwrite)?;

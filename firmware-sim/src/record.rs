@@ -7,11 +7,9 @@
 //! |---|---|---|---|
 //! | `rosbot` | `x_m,y_m,phi_rad,omega_r_radps,omega_l_radps` | 10 Hz | N(0, 9²) clipped to ±32 rad/s, new every sample |
 //! | `two-link-arm` | `theta1_rad,theta2_rad,dtheta1_radps,dtheta2_radps,tau1_Nm,tau2_Nm` | 100 Hz | N(0, 1), new every sample |
-//! | `skid-rosbot` | as `rosbot` | 10 Hz | levels uniform in ±16 rad/s, one in five 0 rad/s, each held for 0.3 s to 2 s |
 //! | `soft-leg` | `y_mm,z_mm,bending_V,extension_V` | 20 Hz | levels uniform in ±12 V, one in five 0 V, each held for 0.2 s to 1 s |
 //!
-//! The first two are the paper's training data; `skid-rosbot` is the invented plant that the simulated
-//! controller drives. 20 Hz for the leg puts at least two samples into
+//! The first two are the paper's training data. 20 Hz for the leg puts at least two samples into
 //! the fastest lag that its tip shows (0.1 s), while the 30 ms of its valves stay below a sample.
 //!
 //! Every trial starts where a new plant does: the ROSbot at the origin (or where it is
@@ -33,7 +31,7 @@
 //!
 //! | robot | standard deviation | decimals |
 //! |---|---|---|
-//! | `rosbot`, `skid-rosbot` | 1 mm, 2 mrad (motion capture) | 6 |
+//! | `rosbot` | 1 mm, 2 mrad (motion capture) | 6 |
 //! | `two-link-arm` | 0.2 mrad, 5 mrad/s (encoders) | 6 |
 //! | `soft-leg` | 0.1 mm (motion capture) | 4 |
 //!
@@ -50,7 +48,6 @@ use crate::excitation::{Excitation, Signal};
 use crate::integrate::{Integrator, Numerical};
 use crate::log::{NOISE_STREAM, Sensor, file_name, is_file_name, rows, stream, write_csv};
 use crate::plant::Plant;
-use crate::rosbot::{self, RosbotParameters};
 use crate::soft_leg::{SoftLeg, SoftLegParameters};
 use std::fmt;
 use std::fs;
@@ -65,8 +62,6 @@ use tempfile::TempPath;
 pub enum Robot {
     /// [`Drive`] with the paper's ROSbot 2.0 dimensions.
     Rosbot,
-    /// [`Rosbot`](crate::rosbot::Rosbot), the invented skid-steered ROSbot.
-    SkidRosbot,
     /// [`Arm`] with the masses and lengths of the paper's arm.
     TwoLinkArm,
     /// [`SoftLeg`], the invented soft pneumatic leg.
@@ -75,13 +70,12 @@ pub enum Robot {
 
 impl Robot {
     /// Every robot.
-    pub const ALL: [Self; 4] = [Self::Rosbot, Self::SkidRosbot, Self::TwoLinkArm, Self::SoftLeg];
+    pub const ALL: [Self; 3] = [Self::Rosbot, Self::TwoLinkArm, Self::SoftLeg];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Rosbot => "rosbot",
-            Self::SkidRosbot => "skid-rosbot",
             Self::TwoLinkArm => "two-link-arm",
             Self::SoftLeg => "soft-leg",
         }
@@ -90,7 +84,7 @@ impl Robot {
     /// Rows per second.
     pub fn rate_hz(self) -> u32 {
         match self {
-            Self::Rosbot | Self::SkidRosbot => 10,
+            Self::Rosbot => 10,
             Self::TwoLinkArm => 100,
             Self::SoftLeg => 20,
         }
@@ -100,7 +94,6 @@ impl Robot {
     pub fn default_integrator(self) -> Integrator {
         match self {
             Self::Rosbot => Integrator::Exact,
-            Self::SkidRosbot => Integrator::Numerical(rosbot::METHOD),
             Self::TwoLinkArm | Self::SoftLeg => Integrator::Numerical(Numerical::RK4),
         }
     }
@@ -114,7 +107,7 @@ impl fmt::Display for Robot {
 
 /// The text names no robot.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("unknown robot `{text}`: expected rosbot, skid-rosbot, two-link-arm, soft-leg or paper")]
+#[error("unknown robot `{text}`: expected rosbot, two-link-arm, soft-leg or paper")]
 pub struct UnknownRobot {
     /// What was given.
     pub text: String,
@@ -238,7 +231,6 @@ fn expect_numbers(
 fn integrators(robot: Robot) -> &'static str {
     match robot {
         Robot::Rosbot => "exact, rk4 or euler",
-        Robot::SkidRosbot => "its own, which cannot be chosen: leave it out",
         Robot::TwoLinkArm => "rk4 or euler",
         Robot::SoftLeg => "rk4",
     }
@@ -248,7 +240,6 @@ fn integrators(robot: Robot) -> &'static str {
 #[derive(Debug, Clone)]
 enum AnyPlant {
     Drive(Drive),
-    Rosbot(rosbot::Rosbot),
     Arm(Arm),
     SoftLeg(SoftLeg),
 }
@@ -320,9 +311,6 @@ impl Recording {
         let plant = match (robot, integrator) {
             (Robot::Rosbot, integrator) => {
                 Drive::new(DriveParameters::default(), integrator).ok().map(AnyPlant::Drive)
-            }
-            (Robot::SkidRosbot, Integrator::Numerical(rosbot::METHOD)) => {
-                rosbot::Rosbot::new(RosbotParameters::default()).ok().map(AnyPlant::Rosbot)
             }
             (Robot::TwoLinkArm, Integrator::Numerical(method)) => {
                 Arm::new(ArmParameters::default(), method).ok().map(AnyPlant::Arm)
@@ -397,10 +385,6 @@ impl Recording {
             AnyPlant::Drive(drive) => {
                 let signal = Signal::Gaussian { std: 9.0, limit: 32.0 };
                 self.write_rows(trial, drive, Excitation::new(signal, 3), Sensor::POSE, out)
-            }
-            AnyPlant::Rosbot(rosbot) => {
-                let signal = Signal::Steps { limit: 16.0, zero_share: 0.2, hold: 3..=20 };
-                self.write_rows(trial, rosbot, Excitation::new(signal, 3), Sensor::POSE, out)
             }
             AnyPlant::Arm(arm) => {
                 let signal = Signal::Gaussian { std: 1.0, limit: f64::INFINITY };

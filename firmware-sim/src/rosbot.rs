@@ -42,7 +42,7 @@ const TICK_S: f64 = 0.01;
 /// durations, far below what moves the robot by a measurable amount.
 const TICK_TOLERANCE_S: f64 = 1e-10;
 /// Of the body, over one controller tick.
-pub(crate) const METHOD: Numerical = Numerical::Rk4 { substeps: NonZeroU32::new(2).unwrap() };
+const METHOD: Numerical = Numerical::Rk4 { substeps: NonZeroU32::new(2).unwrap() };
 
 /// What fixes a [`Rosbot`].
 #[derive(Debug, Clone, Copy, PartialEq)]

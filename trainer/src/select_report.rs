@@ -222,7 +222,7 @@ impl Selection {
         let terms: String = c.terms.iter().map(|t| format!("    {t:?},\n")).collect();
         let (windows, horizon, units) = self.scored;
         format!(
-            "{}\n# Found by `trainer select` among {} candidates: NRMSE {} over {windows} windows of {horizon} steps,\n\
+            "{}\n\n# Found by `trainer select` among {} candidates: NRMSE {} over {windows} windows of {horizon} steps,\n\
              # cross-validated over {units} trajectories or blocks; about {} instructions a step.\n\
              {symmetry}[dictionary]\nstandardise = false\nterms = [\n{terms}]\n\n[fit]\nridge = {:e}\n{refine}",
             text.trim_end(),

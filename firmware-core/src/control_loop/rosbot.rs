@@ -182,6 +182,7 @@ pub struct Rosbot<'m, 'a, 'q, A, E, S, const H: usize> {
     tracker: Tracker<'m, 'a, 3, 2, H>,
     supervisor: Supervisor,
     telemetry: Telemetry<'q>,
+    half_sample_us: u32,
     /// What the host wants (rad/s), right and left.
     wanted: [f32; 2],
     /// What is commanded since the last tick.
@@ -240,6 +241,7 @@ where
             tracker,
             supervisor: Supervisor::new(timing),
             telemetry,
+            half_sample_us: period_us.saturating_mul(settings.ticks_per_sample.into()) / 2,
             wanted: [0.0; 2],
             applied: [0.0; 2],
             sum: [0.0; 2],
@@ -384,7 +386,7 @@ where
             }
         }
         (self.sum, self.ticks) = ([0.0; 2], 0);
-        let measured = Measurement::from(self.sensor.measure());
+        let measured = Measurement::of(&mut self.sensor, self.half_sample_us);
         let held = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
         let tracked = self.tracker.sample(&applied, measured, &held);
         crate::control_loop::take(&tracked, &mut self.supervisor, &mut self.tracker);

@@ -105,6 +105,7 @@ pub struct SoftLeg<'m, 'a, 'q, A, S, const H: usize> {
     tracker: Tracker<'m, 'a, 2, 2, H>,
     supervisor: Supervisor,
     telemetry: Telemetry<'q>,
+    half_sample_us: u32,
     /// What the host wants (V).
     wanted: [f32; 2],
     /// What acts since the last tick (V).
@@ -141,6 +142,7 @@ where
             tracker,
             supervisor: Supervisor::new(timing),
             telemetry,
+            half_sample_us: period_us / 2,
             wanted: [0.0; 2],
             applied: [0.0; 2],
         })
@@ -160,7 +162,7 @@ where
     /// One tick: measures, predicts, acts, reports.
     pub fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
-        let measured = Measurement::from(self.sensor.measure());
+        let measured = Measurement::of(&mut self.sensor, self.half_sample_us);
         let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
         let tracked: Tracked<2> = self.tracker.sample(&self.applied, measured, &next);
         crate::control_loop::take(&tracked, &mut self.supervisor, &mut self.tracker);

@@ -39,9 +39,9 @@ pub struct Alarms(u16);
 impl Alarms {
     /// No command for the time of the watchdog.
     pub const HOST_SILENT: Self = Self(1);
-    /// A tick began or ended too late.
+    /// A tick began more than a quarter of a period late, or ended after the next one was due.
     pub const LATE: Self = Self(1 << 1);
-    /// The clock stood still or went back.
+    /// The clock stood still or went back, or a tick came after less than half a period.
     pub const CLOCK: Self = Self(1 << 2);
     /// Several measurements in a row were NaN, infinite or could not be read.
     pub const SENSOR_BAD: Self = Self(1 << 3);
@@ -64,6 +64,9 @@ impl Alarms {
     /// The model looked at values outside the range it was trained in.
     pub const OUT_OF_RANGE: Self = Self(1 << 12);
 
+    /// A measurement was too old to belong to its sample, and was not used.
+    pub const SENSOR_LATE: Self = Self(1 << 13);
+
     /// Those with which a robot does not go on.
     pub const SAFE: Self = Self(
         Self::HOST_SILENT.0
@@ -78,9 +81,12 @@ impl Alarms {
 
     /// Those that a robot may have while its actuators are off: the others say that it does not move as
     /// the running robot would.
-    pub const AT_REST: Self = Self(Self::SENSOR_BAD.0 | Self::SENSOR_LOST.0);
+    pub const AT_REST: Self = Self(Self::SENSOR_BAD.0 | Self::SENSOR_LOST.0 | Self::SENSOR_LATE.0);
 
-    const NAMES: [(Self, &'static str); 13] = [
+    /// Those that tell of a fault: not that the model was asked beyond its training.
+    pub const TELLING: Self = Self(!Self::OUT_OF_RANGE.0);
+
+    const NAMES: [(Self, &'static str); 14] = [
         (Self::HOST_SILENT, "host silent"),
         (Self::LATE, "late"),
         (Self::CLOCK, "clock"),
@@ -94,6 +100,7 @@ impl Alarms {
         (Self::ACTUATOR, "actuator"),
         (Self::BAD_COMMAND, "bad command"),
         (Self::OUT_OF_RANGE, "out of range"),
+        (Self::SENSOR_LATE, "sensor late"),
     ];
 
     /// None.
@@ -119,6 +126,11 @@ impl Alarms {
     /// Whether there is none.
     pub const fn is_empty(self) -> bool {
         self.0 == 0
+    }
+
+    /// Every alarm with its name, in the order of the bits.
+    pub fn all() -> impl Iterator<Item = (Self, &'static str)> {
+        Self::NAMES.into_iter()
     }
 
     /// Each of them with its name.
@@ -239,7 +251,7 @@ impl Supervisor {
             match now_us.checked_sub(last_us) {
                 None => self.raise(Alarms::CLOCK),
                 Some(elapsed) if elapsed < period_us / 2 => self.raise(Alarms::CLOCK),
-                Some(elapsed) if elapsed > period_us + period_us / 2 => self.raise(Alarms::LATE),
+                Some(elapsed) if elapsed > period_us + period_us / 4 => self.raise(Alarms::LATE),
                 Some(_) => {}
             }
         }

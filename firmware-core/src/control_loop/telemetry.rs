@@ -37,6 +37,8 @@ pub struct Frame {
     pub residual: Vec<f32, MAX_STATES>,
     /// Steps predicted since the last measurement that was used.
     pub steps: u32,
+    /// Steps whose error bound holds for the prediction.
+    pub bound_steps: u32,
     /// Coordinates that the model predicts for the end of its horizon; empty without them.
     pub ahead: Vec<f32, MAX_STATES>,
     /// The longest tick since the frame before (µs).
@@ -112,6 +114,7 @@ impl Frame {
             predicted: optional(&tracked.predicted),
             residual: optional(&tracked.residual),
             steps: tracked.steps,
+            bound_steps: tracked.bound_steps,
             ahead: list(path.last().map_or(&[], |x| x.as_slice())),
             ..Self::default()
         }

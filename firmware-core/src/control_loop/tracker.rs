@@ -1,9 +1,14 @@
 //! The model beside the robot: once per sample it predicts where the robot is now, takes what is
 //! measured, and looks ahead.
+//!
+//! What is measured is compared twice: with the prediction from the last measurement, where sudden things
+//! show (a spike, wheels that slip), and every [`SHADOW`] samples with a second prediction that has not
+//! been corrected since, where slow ones do (a leak, a valve that is stuck, a sensor that stands still).
 
 use crate::control_loop::ControlLoopError;
 use crate::control_loop::monitor::{GATE, Monitor, Verdict};
 use crate::control_loop::supervisor::Alarms;
+use crate::device::PositionSensor;
 use crate::model::{Model, Space};
 use crate::scalar::Scalar;
 use crate::{PredictError, Predictor, PredictorState};
@@ -13,6 +18,10 @@ pub const BAD_MEASUREMENTS: u8 = 3;
 /// Measurements in a row that are not believed; the next one is taken as it comes.
 pub const OUTLIERS: u8 = 3;
 
+/// Samples over which the second prediction runs, fewer where the model's error bounds do not reach so
+/// far.
+pub const SHADOW: u32 = 10;
+
 /// What a sensor said at a sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Measurement<const N: usize> {
@@ -20,13 +29,17 @@ pub enum Measurement<const N: usize> {
     Taken([f32; N]),
     /// Nothing new.
     Missing,
+    /// Something that belongs to an earlier sample.
+    Late,
     /// The sensor could not be read.
     Unreadable,
 }
 
-impl<const N: usize, E> From<Result<Option<[f32; N]>, E>> for Measurement<N> {
-    fn from(result: Result<Option<[f32; N]>, E>) -> Self {
-        match result {
+impl<const N: usize> Measurement<N> {
+    /// Asks a sensor; a measurement older than `limit_us` is [`Late`](Self::Late).
+    pub fn of(sensor: &mut impl PositionSensor<N>, limit_us: u32) -> Self {
+        match sensor.measure() {
+            Ok(Some(_)) if sensor.age_us() > limit_us => Self::Late,
             Ok(Some(coordinates)) => Self::Taken(coordinates),
             Ok(None) => Self::Missing,
             Err(_) => Self::Unreadable,
@@ -47,6 +60,9 @@ pub struct Tracked<const N: usize> {
     pub residual: Option<[f32; N]>,
     /// Steps predicted since the last measurement that was used; 0 when nothing was predicted.
     pub steps: u32,
+    /// Steps whose error bound holds for this prediction: more than `steps` while the model looks back at
+    /// samples that were predicted themselves.
+    pub bound_steps: u32,
     /// The largest residual as a multiple of its error bound; 0 without bounds.
     pub ratio: f32,
     /// What was noticed at this sample.
@@ -63,8 +79,16 @@ pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
     predictor: Predictor<'m, 'a>,
     state: PredictorState,
     monitor: Monitor,
+    /// A prediction without corrections, its monitor, and its length.
+    shadow: PredictorState,
+    slow: Monitor,
+    shadow_steps: u32,
     /// Samples without a measurement that was used.
     blind: u32,
+    /// Which of the last samples were predicted, a bit each, the newest the lowest, as many as the model
+    /// looks at.
+    guessed: u32,
+    looks_at: u32,
     /// The most of them that are allowed.
     blind_limit: u32,
     bad: u8,
@@ -90,11 +114,18 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             }
         }
         let reach = model.error_bounds().and_then(|bounds| bounds.horizons().last().copied());
+        let monitor = model.error_bounds().map_or_else(Monitor::default, Monitor::new);
         Ok(Self {
             predictor: Predictor::new(model),
             state: PredictorState::new(),
-            monitor: Monitor::default(),
+            monitor,
+            shadow: PredictorState::new(),
+            slow: monitor,
+            shadow_steps: reach.map_or(SHADOW, |reach| reach.min(SHADOW)),
             blind: 0,
+            guessed: 0,
+            // At least the present sample; lags are few.
+            looks_at: u32::MAX >> (31 - structure.lag().min(31)),
             blind_limit: reach.map_or(blind_samples, |reach| reach.min(blind_samples)),
             bad: 0,
             outliers: 0,
@@ -145,6 +176,8 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             alarms |= Alarms::OUT_OF_RANGE;
         }
         let steps = predicted.map_or(0, |_| ahead.step());
+        let guesses = (self.guessed & self.looks_at).count_ones();
+        let bound_steps = if predicted.is_some() { steps.max(1 + guesses) } else { 0 };
 
         let taken = match measured {
             Measurement::Taken(x) if x.iter().all(|x| x.is_finite()) => {
@@ -152,6 +185,10 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
                 Some(x)
             }
             Measurement::Missing => None,
+            Measurement::Late => {
+                alarms |= Alarms::SENSOR_LATE;
+                None
+            }
             Measurement::Taken(_) | Measurement::Unreadable => {
                 self.bad = self.bad.saturating_add(1);
                 if self.bad >= BAD_MEASUREMENTS {
@@ -162,7 +199,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         };
         let residual = taken.zip(predicted).map(|(x, expected)| self.residual(&x, &expected));
         let verdict = match (residual, self.model().error_bounds()) {
-            (Some(residual), Some(bounds)) => self.monitor.update(bounds, steps, &residual),
+            (Some(residual), Some(bounds)) => self.monitor.update(bounds, bound_steps, &residual),
             _ => Verdict::default(),
         };
         if verdict.alarm {
@@ -173,11 +210,16 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             self.outliers = if believed { 0 } else { self.outliers + 1 };
         }
         let used = taken.filter(|_| believed);
+        if self.beside(applied, used) {
+            alarms |= Alarms::RESIDUAL;
+        }
+        self.guessed = (self.guessed << 1) | u32::from(used.is_none());
         match used {
             Some(x) => {
                 if verdict.ratio > GATE {
                     // The robot really is elsewhere: its history belongs to the place before.
                     self.state = PredictorState::new();
+                    self.guessed = 0;
                 }
                 // Finite, and of the right length: it cannot be refused.
                 let _ = self.predictor.observe(&mut self.state, applied, &x);
@@ -196,6 +238,14 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             }
         }
 
+        if self.shadow.step() >= self.shadow_steps || self.shadow.history().is_empty() {
+            // It starts from measurements alone: what it is compared with are the bounds of those.
+            self.shadow = match self.guessed & self.looks_at {
+                0 => self.state.clone(),
+                _ => PredictorState::new(),
+            };
+        }
+
         let (predictor, mut future) = (self.predictor, self.state.clone());
         self.ahead = 0;
         for place in &mut self.path {
@@ -211,12 +261,34 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             self.ahead += 1;
         }
         let ratio = verdict.ratio;
-        Tracked { predicted, measured: used, residual, steps, ratio, alarms }
+        Tracked { predicted, measured: used, residual, steps, bound_steps, ratio, alarms }
+    }
+
+    /// Moves the second prediction on; at its end, whether it has been too far off too often.
+    fn beside(&mut self, applied: &[f32; M], used: Option<[f32; N]>) -> bool {
+        if self.predictor.step(&mut self.shadow, applied).is_err() {
+            // Its history is not full, or it diverged, which the first prediction does not miss.
+            self.shadow = PredictorState::new();
+            return false;
+        }
+        if self.shadow.step() < self.shadow_steps {
+            return false;
+        }
+        let expected = self.coordinates(&self.shadow);
+        match (used, self.model().error_bounds()) {
+            (Some(x), Some(bounds)) => {
+                let residual = self.residual(&x, &expected);
+                self.slow.update(bounds, self.shadow.step(), &residual).alarm
+            }
+            _ => false,
+        }
     }
 
     /// Forgets the residuals that have added up, not the history.
     pub fn forget_residuals(&mut self) {
         self.monitor.reset();
+        self.slow.reset();
+        self.shadow = PredictorState::new();
     }
 
     fn coordinates(&self, state: &PredictorState) -> [f32; N] {

@@ -1,0 +1,330 @@
+//! Runs: the very firmware, on a simulated controller, against a robot that misbehaves.
+//!
+//! ```text
+//! host ──commands──> line ──> firmware ──> PWM, pins ──> plant ──> sensors ──> firmware ──> line ──> host
+//! ```
+//!
+//! Everything happens in virtual time. A tick is charged with the instructions that the core's
+//! [cost table](firmware_core::cost) says its predictions take, so that deadlines mean something. The
+//! same model, scenario and seed give the same run.
+//!
+//! | module | what lives there |
+//! |---|---|
+//! | [`scenario`] | what a run does |
+//! | `rig`, `host` (private) | a robot with its firmware; the laptop at the other end of the line |
+//! | [`summary`] | what a run showed |
+//! | [`log`] | the telemetry as logs for the trainer |
+//! | [`figure`], [`live`] | predicted beside measured: a plot, and a view in the terminal |
+//! | [`sweep`] | every fault on every robot, against what is expected |
+
+pub mod figure;
+mod host;
+pub mod live;
+pub mod log;
+mod rig;
+pub mod scenario;
+pub mod summary;
+pub mod sweep;
+
+use crate::bench::{RosbotBench, SoftLegBench};
+use crate::fault::{FaultKind, Faults};
+use crate::mcu::misuse::Misuse;
+use crate::mcu::uart::{self, UartSettings};
+use crate::mcu::{BrownOutDetector, Wire};
+use firmware_core::control_loop::telemetry::{Frame, Telemetry};
+use firmware_core::control_loop::{ControlLoopError, Mode};
+use firmware_core::link::Port;
+use firmware_core::model::{Model, Structure};
+use firmware_core::{blob, cost};
+use heapless::spsc::Queue;
+use rig::{Firmware, Rig};
+use scenario::{Controller, Scenario};
+use std::collections::VecDeque;
+use std::num::NonZeroU32;
+use std::path::Path;
+use summary::{Summary, Watch};
+
+/// Voltage of the microcontroller's supply, and where its brown-out detector resets it (V): STM32F407,
+/// level 3.
+const SUPPLY_VOLT: f64 = 3.3;
+const BROWN_OUT_VOLT: f64 = 2.7;
+/// Frames that wait to be sent.
+const QUEUE: usize = 8;
+
+/// A robot that can be run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Robot {
+    /// The skid-steered ROSbot: models with three states (x, y, heading) and two inputs (wheel speeds).
+    Rosbot,
+    /// The soft leg: models with two states (tip y, z) and two inputs (valve voltages).
+    SoftLeg,
+}
+
+impl Robot {
+    /// The robot that a model is of, by its states and inputs.
+    ///
+    /// # Errors
+    /// [`RunError::Robot`] when it is none of them.
+    pub fn of(structure: &Structure<'_>) -> Result<Self, RunError> {
+        let names = |names: &mut dyn Iterator<Item = &str>| names.collect::<Vec<_>>().join(", ");
+        let states = names(&mut structure.states().iter().map(|s| s.name));
+        let inputs = names(&mut structure.inputs().iter().map(|u| u.name));
+        match (states.as_str(), inputs.as_str()) {
+            ("x, y, phi", "omega_r, omega_l") => Ok(Self::Rosbot),
+            ("y, z", "bending, extension") => Ok(Self::SoftLeg),
+            _ => Err(RunError::Robot { robot: structure.robot().to_owned(), states, inputs }),
+        }
+    }
+
+    /// Time between two ticks of its loop (µs).
+    pub fn tick_us(self) -> u64 {
+        match self {
+            Self::Rosbot => RosbotBench::TICK_US,
+            Self::SoftLeg => SoftLegBench::TICK_US,
+        }
+    }
+
+    /// Random commands stay within this (rad/s, V).
+    pub fn limit(self) -> f64 {
+        match self {
+            Self::Rosbot => RosbotBench::LIMIT,
+            Self::SoftLeg => SoftLegBench::LIMIT,
+        }
+    }
+
+    /// Instructions of a tick of its loop with this model: one that is a sample, with its two predictions
+    /// for now and those ahead, and one that is none.
+    ///
+    /// The model's instructions are those of the [cost table](firmware_core::cost).
+    pub fn instructions(self, model: &Model<'_>, controller: &Controller) -> [u64; 2] {
+        let ahead = match self {
+            Self::Rosbot => RosbotBench::AHEAD,
+            Self::SoftLeg => SoftLegBench::AHEAD,
+        };
+        let step = u64::from(cost::instructions(model.structure(), model.terms()));
+        let rest = u64::from(controller.tick_instructions);
+        [rest + (2 + ahead as u64) * step, rest]
+    }
+}
+
+/// The bytes of a model, at an address that the core accepts.
+#[derive(Debug, Clone)]
+pub struct Blob {
+    words: Vec<u32>,
+    length: usize,
+}
+
+impl Blob {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// Those of the file system, with its name.
+    pub fn read(path: &Path) -> Result<Self, String> {
+        let bytes =
+            std::fs::read(path).map_err(|e| format!("{}: cannot be read: {e}", path.display()))?;
+        Ok(Self::new(&bytes))
+    }
+
+    /// Copies bytes.
+    pub fn new(bytes: &[u8]) -> Self {
+        let mut words = vec![0_u32; bytes.len().div_ceil(4)];
+        bytemuck::cast_slice_mut(&mut words)[..bytes.len()].copy_from_slice(bytes);
+        Self { words, length: bytes.len() }
+    }
+
+    /// The model.
+    ///
+    /// # Errors
+    /// [`RunError::Blob`].
+    pub fn model(&self) -> Result<Model<'_>, RunError> {
+        let bytes: &[u8] = bytemuck::cast_slice(&self.words);
+        firmware_core::parse(&bytes[..self.length]).map_err(RunError::Blob)
+    }
+}
+
+/// Why there is no run, or why it means nothing.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// The blob is refused.
+    #[error("the model is refused: {0:?}")]
+    Blob(blob::ParseError),
+    /// The model is of a robot that is not simulated.
+    #[error(
+        "the model of `{robot}` predicts [{states}] from [{inputs}]; robots that can be run have \
+         [x, y, phi] from [omega_r, omega_l] (models/skid-rosbot) or [y, z] from \
+         [bending, extension] (models/soft-leg)"
+    )]
+    Robot {
+        /// Its name.
+        robot: String,
+        /// Its states.
+        states: String,
+        /// Its inputs.
+        inputs: String,
+    },
+    /// The firmware refuses the model.
+    #[error("the control loop refuses the model: {0:?}; its sample time must be that of the robot")]
+    Firmware(ControlLoopError),
+    /// The scenario makes no sense.
+    #[error(transparent)]
+    Scenario(#[from] scenario::ScenarioError),
+    /// The firmware misused the hardware.
+    #[error("the firmware misused the hardware {} times, first at {} µs: {}", .0.count, .0.first_at_us, .0.first)]
+    Misuse(Misuse),
+    /// Whoever watched the run could not go on.
+    #[error(transparent)]
+    Watcher(#[from] std::io::Error),
+}
+
+/// One sample as it reached the host, beside what really was.
+#[derive(Debug)]
+pub struct Seen<'s> {
+    /// The frame.
+    pub frame: &'s Frame,
+    /// The true coordinates at that time, in the model's units.
+    pub truth: &'s [f64],
+    /// What the loop predicted then for the coming samples, shape `[ahead, states]`.
+    pub path: &'s [f32],
+    /// The faults that were active.
+    pub faults: &'s Faults,
+}
+
+/// Whoever watches a run.
+pub type Watcher<'w> = dyn FnMut(&Seen<'_>) -> std::io::Result<()> + 'w;
+
+/// Runs a model; `watcher` sees every sample that reaches the host.
+///
+/// # Errors
+/// [`RunError`].
+pub fn run(
+    model: &Model<'_>,
+    scenario: &Scenario,
+    seed: u64,
+    watcher: &mut Watcher<'_>,
+) -> Result<Summary, RunError> {
+    let robot = Robot::of(model.structure())?;
+    scenario.check(model.structure().inputs().len())?;
+    match robot {
+        Robot::Rosbot => run_rig::<RosbotBench, 3>(model, robot, scenario, seed, watcher),
+        Robot::SoftLeg => run_rig::<SoftLegBench, 2>(model, robot, scenario, seed, watcher),
+    }
+}
+
+/// What was so when a sample was taken, until its frame reaches the host.
+struct Then<const N: usize> {
+    time_us: u64,
+    truth: [f64; N],
+    path: Vec<f32>,
+}
+
+fn run_rig<R: Rig<N>, const N: usize>(
+    model: &Model<'_>,
+    robot: Robot,
+    scenario: &Scenario,
+    seed: u64,
+    watcher: &mut Watcher<'_>,
+) -> Result<Summary, RunError> {
+    let mut rig = R::new();
+    let clock = rig.clock();
+    let faults = Faults::new(&clock, scenario.faults.iter().map(|fault| fault.0), seed);
+    let line = UartSettings {
+        baud: NonZeroU32::new(scenario.line.baud).unwrap_or(NonZeroU32::MIN),
+        loss: scenario.line.loss,
+        bit_flip: scenario.line.bit_flip,
+        ..UartSettings::default()
+    };
+    let (host_end, mut serial) = uart::pair(&clock, line, seed);
+    let mut host = host::Host::new(host_end, &faults, scenario, R::TICK_US, seed);
+    let supply = Wire::new(SUPPLY_VOLT);
+    let mut detector = BrownOutDetector::new(&supply, BROWN_OUT_VOLT, 0.1);
+
+    let instructions = robot.instructions(model, &scenario.controller);
+    let Controller { clock_mhz, cycles_per_instruction, .. } = scenario.controller;
+    let cost_us =
+        instructions.map(|count| (count as f64 * cycles_per_instruction / clock_mhz).ceil() as u64);
+    let ticks = (scenario.seconds * 1e6 / R::TICK_US as f64).round().max(1.0) as u64;
+    let mut summary = Watch::<N>::new(model, robot, scenario, seed, cost_us);
+    let mut pending: VecDeque<Then<N>> = VecDeque::new();
+    let mut boots = 0;
+    let mut tick = 0;
+
+    while tick < ticks {
+        // A boot: until the end or the next reset.
+        let mut queue = Queue::<Frame, QUEUE>::new();
+        let (producer, mut frames) = queue.split();
+        let mut firmware = None;
+        let mut producer = Some(producer);
+        let (mut port, mut of_boot) = (Port::new(), 0);
+        // What the last tick could not finish in its own time.
+        let mut history = 0;
+        while tick < ticks {
+            // Timers go on while a tick is late: it begins when it can.
+            let due_us = tick * R::TICK_US + faults.late_by_us(R::TICK_US);
+            let now_us = clock.now_ns() / 1000;
+            rig.advance_us(due_us.saturating_sub(now_us));
+            rig.apply(&faults);
+            supply.set(SUPPLY_VOLT * (1.0 - faults.act(FaultKind::BrownOut, None).unwrap_or(0.0)));
+            let seen = host.turn(clock.now_ns() / 1000, |frame| {
+                while pending.front().is_some_and(|then| then.time_us < frame.time_us) {
+                    pending.pop_front();
+                }
+                let Some(then) = pending.pop_front_if(|then| then.time_us == frame.time_us) else {
+                    return Ok(());
+                };
+                summary.sample(model, frame, &then.truth);
+                watcher(&Seen { frame, truth: &then.truth, path: &then.path, faults: &faults })
+            });
+            seen?;
+            tick += 1;
+            if !detector.runs(rig.board()) {
+                summary.off(clock.now_ns() / 1000, rig.is_off());
+                if firmware.is_some() {
+                    break;
+                }
+                continue;
+            }
+            if firmware.is_none() {
+                let telemetry = producer.take().map(Telemetry::new);
+                let Some(telemetry) = telemetry else { break };
+                boots += 1;
+                let booted = rig.boot(model, &faults, seed.wrapping_add(boots), telemetry);
+                firmware = Some(booted.map_err(RunError::Firmware)?);
+            }
+            let Some(firmware) = firmware.as_mut() else { break };
+
+            let began_us = clock.now_ns() / 1000;
+            port.receive(&mut serial, |command| firmware.command(command));
+            let is_sample = of_boot % R::TICKS_PER_SAMPLE == 0;
+            of_boot += 1;
+            let truth = rig.truth();
+            firmware.tick(began_us);
+            if is_sample {
+                let path: Vec<f32> = firmware.path().iter().flatten().copied().collect();
+                pending.push_back(Then { time_us: began_us, truth, path });
+                history += 1;
+            }
+            // While the model's history fills there is nothing to predict.
+            let predicts = is_sample && history > model.structure().lag();
+            rig.advance_us(cost_us[usize::from(!predicts)]);
+            let ended_us = clock.now_ns() / 1000;
+            let mode = firmware.finish(ended_us);
+            port.send(&mut frames, &mut serial);
+            summary.tick(tick - 1, [began_us, ended_us], mode, rig.is_off());
+        }
+    }
+    let resets = rig.board().resets();
+    if let Some(misuse) = rig.board().misuse() {
+        return Err(RunError::Misuse(misuse));
+    }
+    Ok(summary.finish(&faults, resets, host.counts()))
+}
+
+/// The time in `mode` is counted under its number.
+pub(crate) fn number(mode: Mode) -> usize {
+    match mode {
+        Mode::Idle => 0,
+        Mode::Running => 1,
+        Mode::Safe => 2,
+    }
+}

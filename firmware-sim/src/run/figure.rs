@@ -1,0 +1,287 @@
+//! Predicted beside measured, as a plot: the way, and for every state how far off the prediction was.
+
+use crate::fault::Fault;
+use crate::run::Seen;
+use firmware_core::error_bounds::ErrorBounds;
+use plotters::prelude::*;
+use std::collections::VecDeque;
+use std::error::Error;
+use std::ops::Range;
+
+/// Most samples that are drawn; of longer runs every second, third, … one.
+const MOST: usize = 4_000;
+
+/// One sample.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Point {
+    t_s: f64,
+    measured: [f64; 3],
+    /// Residual and its bound per state.
+    residual: [f64; 3],
+    bound: [f64; 3],
+    /// The end of the path that was predicted for now when it began.
+    ahead: [f64; 2],
+    alarm: bool,
+}
+
+/// Collects samples and draws them.
+#[derive(Debug)]
+pub struct Figure<'b> {
+    title: String,
+    states: Vec<(String, String)>,
+    bounds: Option<ErrorBounds<'b>>,
+    faults: Vec<Fault>,
+    /// Ends of paths for samples to come, the oldest first.
+    ends: VecDeque<[f64; 2]>,
+    ahead: usize,
+    points: Vec<Point>,
+    every: usize,
+    seen: usize,
+}
+
+const MEASURED: RGBColor = RGBColor(0, 0, 0);
+const AHEAD: RGBColor = RGBColor(31, 119, 180);
+const RESIDUAL: RGBColor = RGBColor(60, 60, 60);
+const BOUND: RGBColor = RGBColor(44, 160, 44);
+const ALARM: RGBColor = RGBColor(214, 39, 40);
+const FAULT: RGBColor = RGBColor(255, 224, 178);
+
+impl<'b> Figure<'b> {
+    /// A figure of up to three states with their units.
+    pub fn new(
+        title: String,
+        states: Vec<(String, String)>,
+        bounds: Option<ErrorBounds<'b>>,
+        faults: Vec<Fault>,
+    ) -> Self {
+        Self {
+            title,
+            states,
+            bounds,
+            faults,
+            ends: VecDeque::new(),
+            ahead: 0,
+            points: Vec::new(),
+            every: 1,
+            seen: 0,
+        }
+    }
+
+    /// Takes a sample.
+    pub fn sample(&mut self, seen: &Seen<'_>) {
+        let n = self.states.len().min(3);
+        let steps = seen.path.len() / self.states.len().max(1);
+        let end = seen.path.len().checked_sub(self.states.len()).map_or([f64::NAN; 2], |start| {
+            [f64::from(seen.path[start]), f64::from(seen.path[start + 1])]
+        });
+        self.ahead = self.ahead.max(steps);
+        self.ends.push_back(end);
+        let ahead = match self.ends.len() > self.ahead && self.ahead > 0 {
+            true => self.ends.pop_front().unwrap_or([f64::NAN; 2]),
+            false => [f64::NAN; 2],
+        };
+        self.seen += 1;
+        if !self.seen.is_multiple_of(self.every) {
+            return;
+        }
+        let frame = seen.frame;
+        let of = |list: &[f32], i: usize| list.get(i).map_or(f64::NAN, |x| f64::from(*x));
+        let each =
+            |f: &dyn Fn(usize) -> f64| std::array::from_fn(|i| if i < n { f(i) } else { f64::NAN });
+        self.points.push(Point {
+            t_s: frame.time_us as f64 * 1e-6,
+            measured: each(&|i| of(&frame.measured, i)),
+            residual: each(&|i| of(&frame.residual, i)),
+            bound: each(&|i| {
+                let bound = self.bounds.and_then(|b| b.bound(frame.bound_steps, i));
+                bound.map_or(f64::NAN, f64::from)
+            }),
+            ahead,
+            alarm: !(frame.noticed & firmware_core::control_loop::Alarms::TELLING).is_empty(),
+        });
+        if self.points.len() >= MOST {
+            let mut keep = false;
+            self.points.retain(|_| {
+                keep = !keep;
+                keep
+            });
+            self.every *= 2;
+        }
+    }
+
+    /// The plot, SVG.
+    ///
+    /// # Errors
+    /// Those of the drawing library.
+    pub fn svg(&self) -> Result<String, Box<dyn Error>> {
+        let n = self.states.len().min(3);
+        let size = (1180, 560);
+        let mut text = String::new();
+        {
+            let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
+            root.fill(&WHITE)?;
+            root.draw(&Text::new(self.title.clone(), (16, 10), ("sans-serif", 18)))?;
+            let (_, below) = root.split_vertically(36);
+            let (panels, legend) = below.split_vertically(484);
+            let (left, right) = panels.split_horizontally(500);
+            self.way(&left)?;
+            for (i, area) in right.split_evenly((n, 1)).iter().enumerate() {
+                self.residuals(i, i + 1 == n, area)?;
+            }
+            self.legend(&legend)?;
+            root.present()?;
+        }
+        Ok(text)
+    }
+
+    fn way(&self, area: &Area<'_>) -> Result<(), Box<dyn Error>> {
+        let runs = |of: &dyn Fn(&Point) -> (f64, f64)| {
+            let points: Vec<(f64, f64)> = self.points.iter().map(of).collect();
+            points
+        };
+        let measured = runs(&|p| (p.measured[0], p.measured[1]));
+        let ahead = runs(&|p| (p.ahead[0], p.ahead[1]));
+        let all = measured.iter().chain(&ahead);
+        let (x, y) = (span(all.clone().map(|p| p.0)), span(all.map(|p| p.1)));
+        // One metre is as long to the right as upwards.
+        let unit = ((x.end - x.start) / 400.0).max((y.end - y.start) / 380.0);
+        let (x, y) = (widened(&x, unit * 400.0), widened(&y, unit * 380.0));
+        let label = |i: usize| {
+            self.states.get(i).map_or_else(String::new, |(name, unit)| format!("{name} [{unit}]"))
+        };
+        let mut chart = ChartBuilder::on(area)
+            .margin(10)
+            .x_label_area_size(40)
+            .y_label_area_size(58)
+            .build_cartesian_2d(x, y)?;
+        mesh(&mut chart, &label(0), &label(1))?;
+        for run in pieces(&ahead) {
+            chart.draw_series(LineSeries::new(run.iter().copied(), AHEAD.stroke_width(1)))?;
+        }
+        for run in pieces(&measured) {
+            chart.draw_series(LineSeries::new(run.iter().copied(), MEASURED.stroke_width(2)))?;
+        }
+        let alarms = self.points.iter().filter(|p| p.alarm && p.measured[0].is_finite());
+        chart.draw_series(
+            alarms.map(|p| Circle::new((p.measured[0], p.measured[1]), 3, ALARM.filled())),
+        )?;
+        Ok(())
+    }
+
+    fn residuals(&self, i: usize, is_last: bool, area: &Area<'_>) -> Result<(), Box<dyn Error>> {
+        let (first, last) = (self.points.first(), self.points.last());
+        let t = first.map_or(0.0, |p| p.t_s)..last.map_or(1.0, |p| p.t_s.max(1e-3));
+        let bounds = || self.points.iter().map(|p| p.bound[i]).filter(|b| b.is_finite());
+        let residuals = || self.points.iter().map(|p| p.residual[i]).filter(|r| r.is_finite());
+        // The bounds stay readable whatever a fault does: what is beyond four of them is cut off.
+        let widest = bounds().fold(0.0, f64::max);
+        let largest = residuals().map(f64::abs).fold(0.0, f64::max);
+        let most = if widest > 0.0 { largest.clamp(1.3 * widest, 4.0 * widest) } else { largest };
+        let most = 1.05 * most.max(1e-9);
+        let (name, unit) = &self.states[i];
+        let mut chart = ChartBuilder::on(area)
+            .margin(10)
+            .x_label_area_size(if is_last { 40 } else { 14 })
+            .y_label_area_size(70)
+            .build_cartesian_2d(t, -most..most)?;
+        for fault in &self.faults {
+            let ends = (fault.from_s(), fault.until_s().min(1e12));
+            let corners = [(ends.0, -most), (ends.1, most)];
+            chart.draw_series([Rectangle::new(corners, FAULT.filled())])?;
+        }
+        let label = if is_last { "time [s]" } else { "" };
+        mesh(&mut chart, label, &format!("{name} off [{unit}]"))?;
+        for sign in [1.0, -1.0] {
+            let line: Vec<(f64, f64)> =
+                self.points.iter().map(|p| (p.t_s, sign * p.bound[i])).collect();
+            for run in pieces(&line) {
+                chart.draw_series(LineSeries::new(run.iter().copied(), BOUND.stroke_width(1)))?;
+            }
+        }
+        let line: Vec<(f64, f64)> = self
+            .points
+            .iter()
+            .map(|p| (p.t_s, p.residual[i].max(-most).min(most) + 0.0 * p.residual[i]))
+            .collect();
+        for run in pieces(&line) {
+            chart.draw_series(LineSeries::new(run.iter().copied(), RESIDUAL.stroke_width(1)))?;
+        }
+        let alarms = self.points.iter().filter(|p| p.alarm);
+        chart.draw_series(alarms.map(|p| Circle::new((p.t_s, -0.92 * most), 2, ALARM.filled())))?;
+        Ok(())
+    }
+
+    fn legend(&self, area: &Area<'_>) -> Result<(), Box<dyn Error>> {
+        let ahead = format!("predicted {} samples before, inputs held", self.ahead);
+        let entries = [
+            ("measured", MEASURED),
+            (ahead.as_str(), AHEAD),
+            ("measured − predicted", RESIDUAL),
+            ("its error bound", BOUND),
+            ("alarm", ALARM),
+            ("fault", FAULT),
+        ];
+        let mut x = 20;
+        for (name, colour) in entries {
+            if name == "fault" {
+                area.draw(&Rectangle::new([(x, 8), (x + 24, 22)], colour.filled()))?;
+            } else if name == "alarm" {
+                area.draw(&Circle::new((x + 12, 15), 3, colour.filled()))?;
+            } else {
+                area.draw(&PathElement::new([(x, 15), (x + 24, 15)], colour.stroke_width(2)))?;
+            }
+            area.draw(&Text::new(name.to_owned(), (x + 30, 8), ("sans-serif", 14)))?;
+            x += 60 + 8 * name.chars().count() as i32;
+        }
+        Ok(())
+    }
+}
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
+type Context<'a, 'b> = ChartContext<
+    'a,
+    SVGBackend<'b>,
+    Cartesian2d<plotters::coord::types::RangedCoordf64, plotters::coord::types::RangedCoordf64>,
+>;
+
+fn mesh(chart: &mut Context<'_, '_>, x: &str, y: &str) -> Result<(), Box<dyn Error>> {
+    let plain = |v: &f64| {
+        let short = (v * 1e6).round() / 1e6;
+        if short == 0.0 { "0".to_owned() } else { short.to_string() }
+    };
+    chart
+        .configure_mesh()
+        .x_desc(x)
+        .y_desc(y)
+        .x_labels(7)
+        .y_labels(5)
+        .x_label_formatter(&plain)
+        .y_label_formatter(&plain)
+        .label_style(("sans-serif", 12))
+        .axis_desc_style(("sans-serif", 14))
+        .light_line_style(TRANSPARENT)
+        .bold_line_style(RGBColor(225, 225, 225))
+        .draw()?;
+    Ok(())
+}
+
+/// Runs of finite points.
+fn pieces(points: &[(f64, f64)]) -> impl Iterator<Item = &[(f64, f64)]> {
+    points.split(|(x, y)| !(x.is_finite() && y.is_finite())).filter(|run| run.len() > 1)
+}
+
+fn span(values: impl Iterator<Item = f64>) -> Range<f64> {
+    let finite = values.filter(|v| v.is_finite());
+    let (low, high) =
+        finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+    if low > high {
+        return 0.0..1.0;
+    }
+    let room = 0.05 * (high - low).max(1e-3);
+    low - room..high + room
+}
+
+fn widened(range: &Range<f64>, width: f64) -> Range<f64> {
+    let middle = 0.5 * (range.start + range.end);
+    middle - 0.5 * width..middle + 0.5 * width
+}
