@@ -218,10 +218,8 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
         name => format!("{}: {name}", structure.robot()),
     };
     let faults = scenario.faults.iter().map(|fault| fault.0).collect();
-    let mut figure = args
-        .plot
-        .as_ref()
-        .map(|_| Figure::new(title, states.clone(), model.error_bounds(), faults));
+    let horizon = run::Robot::of(structure).map_or(10, run::Robot::ahead);
+    let mut figure = args.plot.as_ref().map(|_| Figure::new(title, &model, horizon, faults));
     let mut live = args.live.then(|| (Live::new(), std::time::Instant::now()));
     if args.live {
         // Clears the screen; every picture begins at its top.
@@ -232,7 +230,7 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
             logger.frame(seen.frame)?;
         }
         if let Some(figure) = &mut figure {
-            figure.sample(seen);
+            figure.sample(seen.frame);
         }
         if let Some((live, began)) = &mut live {
             let mut out = std::io::stdout().lock();

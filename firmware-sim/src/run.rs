@@ -84,6 +84,14 @@ impl Robot {
         }
     }
 
+    /// Samples that its loop looks ahead.
+    pub fn ahead(self) -> u32 {
+        match self {
+            Self::Rosbot => RosbotBench::AHEAD as u32,
+            Self::SoftLeg => SoftLegBench::AHEAD as u32,
+        }
+    }
+
     /// Random commands stay within this (rad/s, V).
     pub fn limit(self) -> f64 {
         match self {
@@ -97,13 +105,9 @@ impl Robot {
     ///
     /// The model's instructions are those of the [cost table](firmware_core::cost).
     pub fn instructions(self, model: &Model<'_>, controller: &Controller) -> [u64; 2] {
-        let ahead = match self {
-            Self::Rosbot => RosbotBench::AHEAD,
-            Self::SoftLeg => SoftLegBench::AHEAD,
-        };
         let step = u64::from(cost::instructions(model.structure(), model.terms()));
         let rest = u64::from(controller.tick_instructions);
-        [rest + (2 + ahead as u64) * step, rest]
+        [rest + (2 + u64::from(self.ahead())) * step, rest]
     }
 }
 

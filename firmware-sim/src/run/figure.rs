@@ -1,10 +1,12 @@
-//! Predicted beside measured, as a plot: the way, and for every state how far off the prediction was.
+//! Predicted beside measured, as a plot: the way, with rollouts over the horizon under the inputs that were
+//! applied, and for every state how far off the prediction of the loop was.
 
 use crate::fault::Fault;
-use crate::run::Seen;
-use firmware_core::error_bounds::ErrorBounds;
+use firmware_core::capacity::MAX_STATES;
+use firmware_core::control_loop::{Alarms, Frame, Mode};
+use firmware_core::model::Model;
+use firmware_core::{Predictor, PredictorState};
 use plotters::prelude::*;
-use std::collections::VecDeque;
 use std::error::Error;
 use std::ops::Range;
 
@@ -19,8 +21,8 @@ struct Point {
     /// Residual and its bound per state.
     residual: [f64; 3],
     bound: [f64; 3],
-    /// The end of the path that was predicted for now when it began.
-    ahead: [f64; 2],
+    /// The rollout: begun from measurements up to a horizon ago.
+    rollout: [f64; 2],
     alarm: bool,
 }
 
@@ -29,62 +31,79 @@ struct Point {
 pub struct Figure<'b> {
     title: String,
     states: Vec<(String, String)>,
-    bounds: Option<ErrorBounds<'b>>,
+    model: &'b Model<'b>,
     faults: Vec<Fault>,
-    /// Ends of paths for samples to come, the oldest first.
-    ends: VecDeque<[f64; 2]>,
-    ahead: usize,
+    horizon: u32,
+    /// The samples as measured, and the rollout from some of them.
+    measured: PredictorState,
+    rollout: PredictorState,
+    next_sequence: u32,
     points: Vec<Point>,
     every: usize,
     seen: usize,
 }
 
 const MEASURED: RGBColor = RGBColor(0, 0, 0);
-const AHEAD: RGBColor = RGBColor(31, 119, 180);
+const ROLLOUT: RGBColor = RGBColor(31, 119, 180);
 const RESIDUAL: RGBColor = RGBColor(60, 60, 60);
 const BOUND: RGBColor = RGBColor(44, 160, 44);
 const ALARM: RGBColor = RGBColor(214, 39, 40);
 const FAULT: RGBColor = RGBColor(255, 224, 178);
 
 impl<'b> Figure<'b> {
-    /// A figure of up to three states with their units.
-    pub fn new(
-        title: String,
-        states: Vec<(String, String)>,
-        bounds: Option<ErrorBounds<'b>>,
-        faults: Vec<Fault>,
-    ) -> Self {
+    /// A figure of a model's first states, three at most, with rollouts of `horizon` samples.
+    pub fn new(title: String, model: &'b Model<'b>, horizon: u32, faults: Vec<Fault>) -> Self {
+        let states = model.structure().states().iter();
         Self {
             title,
-            states,
-            bounds,
+            states: states.map(|s| (s.name.to_owned(), s.unit.to_owned())).collect(),
+            model,
             faults,
-            ends: VecDeque::new(),
-            ahead: 0,
+            horizon,
+            measured: PredictorState::new(),
+            rollout: PredictorState::new(),
+            next_sequence: 0,
             points: Vec::new(),
             every: 1,
             seen: 0,
         }
     }
 
+    /// Moves the rollout on; where it is now. It begins anew at every horizon, with a gap.
+    fn roll_out(&mut self, frame: &Frame) -> [f64; 2] {
+        let predictor = Predictor::new(self.model);
+        let gap = std::mem::replace(&mut self.next_sequence, frame.sequence.wrapping_add(1))
+            != frame.sequence;
+        if gap || frame.measured.is_empty() || frame.mode != Mode::Running {
+            self.measured = PredictorState::new();
+            self.rollout = PredictorState::new();
+            if frame.measured.is_empty() {
+                return [f64::NAN; 2];
+            }
+        }
+        let mut place = [f64::NAN; 2];
+        let mut x = [0.0; MAX_STATES];
+        let x = &mut x[..self.states.len()];
+        let stepped = predictor.step(&mut self.rollout, &frame.applied).is_ok();
+        if stepped && predictor.coordinates(&self.rollout, x).is_ok() && x.len() >= 2 {
+            place = [f64::from(x[0]), f64::from(x[1])];
+        }
+        // Frames of a loop hold finite numbers, as many as its model has.
+        let _ = predictor.observe(&mut self.measured, &frame.applied, &frame.measured);
+        if !stepped || self.rollout.step() >= self.horizon {
+            self.rollout = self.measured.clone();
+        }
+        place
+    }
+
     /// Takes a sample.
-    pub fn sample(&mut self, seen: &Seen<'_>) {
+    pub fn sample(&mut self, frame: &Frame) {
         let n = self.states.len().min(3);
-        let steps = seen.path.len() / self.states.len().max(1);
-        let end = seen.path.len().checked_sub(self.states.len()).map_or([f64::NAN; 2], |start| {
-            [f64::from(seen.path[start]), f64::from(seen.path[start + 1])]
-        });
-        self.ahead = self.ahead.max(steps);
-        self.ends.push_back(end);
-        let ahead = match self.ends.len() > self.ahead && self.ahead > 0 {
-            true => self.ends.pop_front().unwrap_or([f64::NAN; 2]),
-            false => [f64::NAN; 2],
-        };
+        let rollout = self.roll_out(frame);
         self.seen += 1;
         if !self.seen.is_multiple_of(self.every) {
             return;
         }
-        let frame = seen.frame;
         let of = |list: &[f32], i: usize| list.get(i).map_or(f64::NAN, |x| f64::from(*x));
         let each =
             |f: &dyn Fn(usize) -> f64| std::array::from_fn(|i| if i < n { f(i) } else { f64::NAN });
@@ -93,11 +112,11 @@ impl<'b> Figure<'b> {
             measured: each(&|i| of(&frame.measured, i)),
             residual: each(&|i| of(&frame.residual, i)),
             bound: each(&|i| {
-                let bound = self.bounds.and_then(|b| b.bound(frame.bound_steps, i));
+                let bound = self.model.error_bounds().and_then(|b| b.bound(frame.bound_steps, i));
                 bound.map_or(f64::NAN, f64::from)
             }),
-            ahead,
-            alarm: !(frame.noticed & firmware_core::control_loop::Alarms::TELLING).is_empty(),
+            rollout,
+            alarm: !(frame.noticed & Alarms::TELLING).is_empty(),
         });
         if self.points.len() >= MOST {
             let mut keep = false;
@@ -140,8 +159,8 @@ impl<'b> Figure<'b> {
             points
         };
         let measured = runs(&|p| (p.measured[0], p.measured[1]));
-        let ahead = runs(&|p| (p.ahead[0], p.ahead[1]));
-        let all = measured.iter().chain(&ahead);
+        let rollouts = runs(&|p| (p.rollout[0], p.rollout[1]));
+        let all = measured.iter().chain(&rollouts);
         let (x, y) = (span(all.clone().map(|p| p.0)), span(all.map(|p| p.1)));
         // One metre is as long to the right as upwards.
         let unit = ((x.end - x.start) / 400.0).max((y.end - y.start) / 380.0);
@@ -155,11 +174,11 @@ impl<'b> Figure<'b> {
             .y_label_area_size(58)
             .build_cartesian_2d(x, y)?;
         mesh(&mut chart, &label(0), &label(1))?;
-        for run in pieces(&ahead) {
-            chart.draw_series(LineSeries::new(run.iter().copied(), AHEAD.stroke_width(1)))?;
+        for run in pieces(&rollouts) {
+            chart.draw_series(LineSeries::new(run.iter().copied(), ROLLOUT.stroke_width(2)))?;
         }
         for run in pieces(&measured) {
-            chart.draw_series(LineSeries::new(run.iter().copied(), MEASURED.stroke_width(2)))?;
+            chart.draw_series(LineSeries::new(run.iter().copied(), MEASURED.stroke_width(1)))?;
         }
         let alarms = self.points.iter().filter(|p| p.alarm && p.measured[0].is_finite());
         chart.draw_series(
@@ -212,10 +231,10 @@ impl<'b> Figure<'b> {
     }
 
     fn legend(&self, area: &Area<'_>) -> Result<(), Box<dyn Error>> {
-        let ahead = format!("predicted {} samples before, inputs held", self.ahead);
+        let rollout = format!("rollouts of {} samples, inputs as applied", self.horizon);
         let entries = [
             ("measured", MEASURED),
-            (ahead.as_str(), AHEAD),
+            (rollout.as_str(), ROLLOUT),
             ("measured − predicted", RESIDUAL),
             ("its error bound", BOUND),
             ("alarm", ALARM),
@@ -231,7 +250,7 @@ impl<'b> Figure<'b> {
                 area.draw(&PathElement::new([(x, 15), (x + 24, 15)], colour.stroke_width(2)))?;
             }
             area.draw(&Text::new(name.to_owned(), (x + 30, 8), ("sans-serif", 14)))?;
-            x += 60 + 8 * name.chars().count() as i32;
+            x += 56 + 7 * name.chars().count() as i32;
         }
         Ok(())
     }

@@ -178,10 +178,7 @@ impl<const N: usize> Watch<N> {
         seed: u64,
         cost_us: [u64; 2],
     ) -> Self {
-        let ahead = match robot {
-            Robot::Rosbot => 10,
-            Robot::SoftLeg => 20,
-        };
+        let ahead = robot.ahead() as usize;
         let structure = model.structure();
         let named = |s: &firmware_core::model::State<'_>| (s.name.to_owned(), s.unit.to_owned());
         let tracked = |fault: Fault| Tracked {
@@ -432,7 +429,7 @@ pub(crate) fn grouped(n: u64) -> String {
     let digits = n.to_string();
     let mut text = String::new();
     for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i) % 3 == 0 {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
             text.push(',');
         }
         text.push(digit);
