@@ -33,7 +33,7 @@ use sha2::{Digest, Sha256};
 
 use crate::arx::MAX_LAGS;
 use crate::cost::Cost;
-use crate::library::{Chain, Frame, Term, library};
+use crate::library::{Chain, Frame, MAX_CHAIN, MAX_LIBRARY_LAG, Term, library};
 use crate::report::hexadecimal;
 use crate::robot::{FitOptions, Robot, ScoreOptions};
 use crate::score::{self, Counts, Lifted, ScoreError};
@@ -80,6 +80,8 @@ pub struct Budget {
     pub bytes: u32,
     /// Terms, the constant not counted.
     pub terms: usize,
+    /// Oldest sample looked at.
+    pub lag: usize,
     /// Candidates evaluated, refinements not counted.
     pub candidates: usize,
     /// Time before the front is refined; where it cuts depends on the machine, and [`Selection::searched`] says how far it came.
@@ -92,6 +94,7 @@ impl Default for Budget {
             instructions: u32::MAX,
             bytes: u32::MAX,
             terms: 60,
+            lag: usize::from(MAX_LIBRARY_LAG),
             candidates: usize::MAX,
             time: Duration::from_secs(80),
         }
@@ -848,7 +851,9 @@ pub fn select<T: Trajectories>(
     let mut frames = Frame::all(robot);
     let mut problems = Vec::new();
     frames.retain(|frame| {
-        let problem = Problem::new(robot, frame, library(robot, frame), &data);
+        let mut terms = library(robot, frame);
+        terms.retain(|term| term.lag() <= options.budget.lag);
+        let problem = Problem::new(robot, frame, terms, &data);
         let possible = problem.is_some();
         problems.extend(problem);
         possible
@@ -1187,6 +1192,16 @@ mod tests {
         assert!(matches!(refused, Err(SelectError::Nothing { evaluated: 1.., .. })));
         let short = InMemory { trajectories: &[Trajectory::default()], ..source };
         assert!(matches!(select(&robot, &short, &options, &|_| {}), Err(SelectError::Score(_))));
+    }
+
+    #[test]
+    fn no_older_sample_is_looked_at_than_asked() {
+        let (robot, walk) = (robot(CART), bilinear());
+        let mut options = options(&robot, 200);
+        options.budget.lag = 0;
+        let found = search(&robot, &walk, &options);
+        let terms = found.candidates.iter().flat_map(|c| &c.terms);
+        assert!(terms.clone().count() > 0 && terms.clone().all(|t| !t.contains('@')));
     }
 
     #[test]
