@@ -54,7 +54,7 @@ const REFINED: usize = 8;
 /// gain little.
 const REFINED_COEFFICIENTS: usize = 240;
 /// How firmly the one-step fit holds a refinement, as far as each is better than the one before.
-pub const KAPPAS: [f64; 3] = [1.0, 0.1, 0.01];
+pub const KAPPAS: [f64; 5] = [1.0, 0.1, 0.01, 0.001, 1e-4];
 /// A refinement that gains less than this fraction of the error is not worth having.
 const WORTH_REFINING: f64 = 0.01;
 /// The ridge of the search.
@@ -434,28 +434,36 @@ impl<'s> Search<'s> {
         let count = front.len().min(REFINED);
         for i in (1..=count).map(|i| front[i * front.len() / count - 1]) {
             let set = self.models[i].clone();
-            let mut error = self.candidates[i].nrmse * (1.0 - WORTH_REFINING);
-            for kappa in KAPPAS {
-                let refine = Some(kappa);
-                let key = self.key(&set, refine);
-                let known = self.journal.known.get(&key).cloned();
-                let is_new = known.is_none();
-                let outcome = known.unwrap_or_else(|| {
-                    evaluate(
-                        (&self.problems, self.data),
-                        &set,
-                        self.refinement(refine),
-                        &self.data.searched,
-                    )
-                });
-                self.take(set.clone(), refine, (&key, is_new), &outcome);
-                (self.progress)(Progress { evaluated: self.candidates.len(), best: self.best });
-                let found = self.candidates.last().map_or(f64::INFINITY, |c| c.nrmse);
-                if found >= error {
-                    break;
-                }
-                error = found;
+            let worth = self.candidates[i].nrmse * (1.0 - WORTH_REFINING);
+            self.refine(&set, worth, f64::INFINITY);
+        }
+        // Of the best one a small gain may be followed by larger ones.
+        if let Some(best) = self.leader(None, 1).first().copied()
+            && let Some(held) = self.candidates[best].refine
+        {
+            let set = self.models[best].clone();
+            self.refine(&set, self.candidates[best].nrmse, held);
+        }
+    }
+
+    /// Refines a model, held less and less firmly, as far as each is better than the error before.
+    fn refine(&mut self, set: &Model, mut error: f64, held: f64) {
+        for kappa in KAPPAS.into_iter().filter(|kappa| *kappa < held) {
+            let refine = Some(kappa);
+            let key = self.key(set, refine);
+            let known = self.journal.known.get(&key).cloned();
+            let is_new = known.is_none();
+            let outcome = known.unwrap_or_else(|| {
+                let problems = (&self.problems[..], self.data);
+                evaluate(problems, set, self.refinement(refine), &self.data.searched)
+            });
+            self.take(set.clone(), refine, (&key, is_new), &outcome);
+            (self.progress)(Progress { evaluated: self.candidates.len(), best: self.best });
+            let found = self.candidates.last().map_or(f64::INFINITY, |c| c.nrmse);
+            if found >= error {
+                break;
             }
+            error = found;
         }
     }
 
@@ -750,7 +758,9 @@ impl<'s> Search<'s> {
         let ridge = self.ridges(&self.leader(Some(frame), 3)).unwrap_or(start);
         // Starts: the best sets of different sizes, and the simplest.
         let mut starts: Vec<Vec<usize>> = Vec::new();
-        for (low, high) in [(0, 20), (20, 50), (50, 100)] {
+        // Large ones first where they are asked for: from small ones it is a long way.
+        let large = (self.options.budget.terms > 100).then_some((100, MAX_CHAIN));
+        for (low, high) in large.into_iter().chain([(0, 20), (20, 50), (50, 100)]) {
             let best = (0..self.candidates.len())
                 .filter(|i| {
                     let c = &self.candidates[*i];
