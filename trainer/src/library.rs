@@ -20,6 +20,8 @@ use firmware_core::cost::Cost;
 
 /// Terms of a library, the constant not counted.
 pub const MAX_LIBRARY: usize = 400;
+/// Terms of the library of an arm: two angles, and states on ℝ.
+pub const MAX_ARM_LIBRARY: usize = 600;
 /// The oldest sample of a library: what the linear ARX looks at.
 pub const MAX_LIBRARY_LAG: u8 = 5;
 /// Entries of a chain that the controller has room for, the constant not counted.
@@ -30,6 +32,9 @@ pub const MAX_FUNCTIONS: usize = 128;
 const MAX_POWER: u8 = 3;
 /// Highest harmonic of an angle.
 const MAX_HARMONIC: u8 = 4;
+/// Highest harmonic of the angles of an arm, the second one first: the inverse of its inertia is no
+/// polynomial in their sines and cosines, its harmonics fall by a factor of two or three each.
+const ARM_HARMONICS: [u8; 2] = [8, 4];
 /// Functions up to these lags enter products: increments, inputs.
 const PRODUCT_LAGS: (u8, u8) = (2, 3);
 
@@ -274,12 +279,15 @@ impl Frame {
     }
 }
 
-/// The library of a frame: at most [`MAX_LIBRARY`] terms of at most the core's observables.
+/// The library of a frame: at most [`MAX_LIBRARY`] terms, or [`MAX_ARM_LIBRARY`], of at most the
+/// core's observables.
 ///
 /// In the order of preference:
 /// 1. single functions of degree 1 and single harmonics;
-/// 2. for two angles with states on ℝ: harmonics of one angle × {1, sin, cos of the other} ×
-///    {1, products of powers of the rates up to 2 each, inputs}, those of the second angle first;
+/// 2. for two angles with states on ℝ, what a step of an arm is made of up to the second order of the
+///    sample time, its accelerations and how they change: harmonics of an angle × {products of the
+///    rates up to degree 3, inputs × {1, rates}}, and × {sin, cos of the other} × {1, rates}, which is
+///    gravity; those of the second angle first, as the inertia depends on it;
 /// 3. powers and products of two and of three functions.
 ///
 /// Within 1 and 3 the cheaper term first: a function costs its degree (half of it for harmonics
@@ -326,27 +334,27 @@ pub fn library(robot: &Robot, frame: &Frame) -> Vec<Term> {
             if rates.is_empty() { lines.clone() } else { rates }
         };
         let power = |i: u8, degree: u8| (degree > 0).then(|| function(Kind::State, i, 0, degree));
-        let mut tails: Vec<Vec<Function>> = vec![Vec::new()];
-        for (p, q) in [(1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (2, 1), (1, 2), (2, 2)] {
+        let rates = |(p, q): (u8, u8)| {
             let pair = [rates.first().map(|i| power(*i, p)), rates.get(1).map(|i| power(*i, q))];
-            tails.push(pair.into_iter().flatten().flatten().collect());
-        }
-        tails.extend((0..robot.inputs.len() as u8).map(|i| vec![function(Kind::Input, i, 0, 1)]));
-        let mut angle_parts = Vec::new();
-        for (angle, other) in [(b, a), (a, b)] {
-            for o in one().chain(harmonics(*other, 1).map(Some)) {
-                for h in one().chain(harmonics(*angle, MAX_HARMONIC).map(Some)) {
-                    angle_parts.push((angle, o.is_some(), [h, o]));
-                }
-            }
-        }
-        // Those without the other angle, then gravity, then the rest.
-        for (mixed, moving) in [(false, true), (true, false), (true, true)] {
-            for angle in [b, a] {
-                for (_, _, part) in angle_parts.iter().filter(|p| (p.0, p.1) == (angle, mixed)) {
-                    for tail in tails.iter().filter(|t| t.is_empty() != moving) {
-                        arm.extend(Term::new(part.iter().flatten().chain(tail).copied().collect()));
-                    }
+            pair.into_iter().flatten().flatten().collect::<Vec<_>>()
+        };
+        let inputs = (0..robot.inputs.len() as u8).map(|i| function(Kind::Input, i, 0, 1));
+        let slow = [(0, 0), (1, 0), (0, 1)];
+        let fast = [(2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)];
+        let mut tails: Vec<Vec<Function>> = slow.into_iter().chain(fast).map(rates).collect();
+        tails.extend(slow.into_iter().flat_map(|p| {
+            inputs.clone().map(move |input| rates(p).into_iter().chain([input]).collect())
+        }));
+        for ((angle, other), order) in [(b, a), (a, b)].into_iter().zip(ARM_HARMONICS) {
+            let parts: Vec<Option<Function>> =
+                one().chain(harmonics(*angle, order).map(Some)).collect();
+            let mut product = |h: &Option<Function>, o: Option<Function>, tail: &[Function]| {
+                arm.extend(Term::new(h.iter().chain(&o).chain(tail).copied().collect()));
+            };
+            for h in &parts {
+                tails.iter().for_each(|tail| product(h, None, tail));
+                for o in harmonics(*other, 1) {
+                    slow.iter().for_each(|p| product(h, Some(o), &rates(*p)));
                 }
             }
         }
@@ -374,11 +382,12 @@ pub fn library(robot: &Robot, frame: &Frame) -> Vec<Term> {
     }
     rest.sort_by_key(|t| (t.price(), t.clone()));
 
+    let most = if arm.is_empty() { MAX_LIBRARY } else { MAX_ARM_LIBRARY };
     let mut library: Vec<Term> = Vec::new();
     let mut held = std::collections::BTreeSet::new();
     let mut observables = std::collections::BTreeSet::new();
     for term in first.into_iter().chain(arm).chain(rest) {
-        if library.len() == MAX_LIBRARY {
+        if library.len() == most {
             break;
         }
         // Sine and cosine are two observables.
@@ -598,7 +607,7 @@ mod tests {
             let names = Names { states: &states, inputs: &inputs };
             for frame in Frame::all(&robot) {
                 let library = library(&robot, &frame);
-                assert!(library.len() > 100 && library.len() <= MAX_LIBRARY);
+                assert!(library.len() > 100 && library.len() <= MAX_ARM_LIBRARY);
                 for (i, term) in library.iter().enumerate() {
                     assert_eq!(Term::parse(&term.name(&names), &names).as_ref(), Some(term));
                     assert!(!library[..i].contains(term));
@@ -616,6 +625,25 @@ mod tests {
         let names = Names { states: &["x"], inputs: &["u"] };
         for wrong in ["", "z", "sin(u)", "d(x)", "x^0", "x*x", "x**u", "x@", "sin(x)*cos(2*x)"] {
             assert_eq!(Term::parse(wrong, &names), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn the_library_of_an_arm_holds_its_accelerations_and_how_they_change() {
+        let robot = arm();
+        let (states, inputs) = robot_names(&robot);
+        let names = Names { states: &states, inputs: &inputs };
+        let library = library(&robot, &Frame::all(&robot)[1]);
+        for term in [
+            "cos(8*b)*u",
+            "sin(8*b)*db*u",
+            "sin(8*b)*da*db^2",
+            "sin(a)*sin(8*b)*da",
+            "cos(4*a)*db*u",
+            "cos(4*a)*sin(b)",
+            "d(a)@5",
+        ] {
+            assert!(library.contains(&Term::parse(term, &names).unwrap()), "{term}");
         }
     }
 

@@ -184,6 +184,9 @@ struct SelectArgs {
     /// Most terms beside the constant [default: as in robot.toml, or 60].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=255))]
     max_terms: Option<u32>,
+    /// Oldest sample looked at; 0: the present one alone [default: as in robot.toml, or 5].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=5))]
+    max_lag: Option<u32>,
     /// Stop after this many candidates: the number that a report gives repeats its search exactly.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     max_candidates: Option<u32>,
@@ -1216,6 +1219,7 @@ fn select_model(args: &SelectArgs) -> Result<(), Failure> {
             ),
             bytes: limit(args.max_bytes, described.max_bytes, default.bytes),
             terms: args.max_terms.or(described.max_terms).map_or(default.terms, |n| n as usize),
+            lag: args.max_lag.or(described.max_lag).map_or(default.lag, |n| n as usize),
             candidates: args.max_candidates.map_or(default.candidates, |n| n as usize),
             time: std::time::Duration::from_secs(args.time_limit.into()),
         },

@@ -260,6 +260,8 @@ pub struct BudgetOptions {
     pub max_bytes: Option<u32>,
     /// Terms beside the constant.
     pub max_terms: Option<u32>,
+    /// Samples looked back at.
+    pub max_lag: Option<u32>,
 }
 
 /// A state coordinate of the robot.

@@ -27,12 +27,13 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
+use firmware_core::cost::Cost;
 use firmware_core::model::{Symmetry, Target};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::arx::MAX_LAGS;
-use crate::library::{Chain, Frame, Term, library};
+use crate::library::{Chain, Frame, MAX_CHAIN, MAX_LIBRARY_LAG, Term, library};
 use crate::report::hexadecimal;
 use crate::robot::{FitOptions, Robot, ScoreOptions};
 use crate::score::{self, Counts, Lifted, ScoreError};
@@ -54,7 +55,7 @@ const REFINED: usize = 8;
 /// gain little.
 const REFINED_COEFFICIENTS: usize = 240;
 /// How firmly the one-step fit holds a refinement, as far as each is better than the one before.
-pub const KAPPAS: [f64; 3] = [1.0, 0.1, 0.01];
+pub const KAPPAS: [f64; 5] = [1.0, 0.1, 0.01, 0.001, 1e-4];
 /// A refinement that gains less than this fraction of the error is not worth having.
 const WORTH_REFINING: f64 = 0.01;
 /// The ridge of the search.
@@ -80,6 +81,8 @@ pub struct Budget {
     pub bytes: u32,
     /// Terms, the constant not counted.
     pub terms: usize,
+    /// Oldest sample looked at.
+    pub lag: usize,
     /// Candidates evaluated, refinements not counted.
     pub candidates: usize,
     /// Time before the front is refined; where it cuts depends on the machine, and [`Selection::searched`] says how far it came.
@@ -92,6 +95,7 @@ impl Default for Budget {
             instructions: u32::MAX,
             bytes: u32::MAX,
             terms: 60,
+            lag: usize::from(MAX_LIBRARY_LAG),
             candidates: usize::MAX,
             time: Duration::from_secs(80),
         }
@@ -431,28 +435,36 @@ impl<'s> Search<'s> {
         let count = front.len().min(REFINED);
         for i in (1..=count).map(|i| front[i * front.len() / count - 1]) {
             let set = self.models[i].clone();
-            let mut error = self.candidates[i].nrmse * (1.0 - WORTH_REFINING);
-            for kappa in KAPPAS {
-                let refine = Some(kappa);
-                let key = self.key(&set, refine);
-                let known = self.journal.known.get(&key).cloned();
-                let is_new = known.is_none();
-                let outcome = known.unwrap_or_else(|| {
-                    evaluate(
-                        (&self.problems, self.data),
-                        &set,
-                        self.refinement(refine),
-                        &self.data.searched,
-                    )
-                });
-                self.take(set.clone(), refine, (&key, is_new), &outcome);
-                (self.progress)(Progress { evaluated: self.candidates.len(), best: self.best });
-                let found = self.candidates.last().map_or(f64::INFINITY, |c| c.nrmse);
-                if found >= error {
-                    break;
-                }
-                error = found;
+            let worth = self.candidates[i].nrmse * (1.0 - WORTH_REFINING);
+            self.refine(&set, worth, f64::INFINITY);
+        }
+        // Of the best one a small gain may be followed by larger ones.
+        if let Some(best) = self.leader(None, 1).first().copied()
+            && let Some(held) = self.candidates[best].refine
+        {
+            let set = self.models[best].clone();
+            self.refine(&set, self.candidates[best].nrmse, held);
+        }
+    }
+
+    /// Refines a model, held less and less firmly, as far as each is better than the error before.
+    fn refine(&mut self, set: &Model, mut error: f64, held: f64) {
+        for kappa in KAPPAS.into_iter().filter(|kappa| *kappa < held) {
+            let refine = Some(kappa);
+            let key = self.key(set, refine);
+            let known = self.journal.known.get(&key).cloned();
+            let is_new = known.is_none();
+            let outcome = known.unwrap_or_else(|| {
+                let problems = (&self.problems[..], self.data);
+                evaluate(problems, set, self.refinement(refine), &self.data.searched)
+            });
+            self.take(set.clone(), refine, (&key, is_new), &outcome);
+            (self.progress)(Progress { evaluated: self.candidates.len(), best: self.best });
+            let found = self.candidates.last().map_or(f64::INFINITY, |c| c.nrmse);
+            if found >= error {
+                break;
             }
+            error = found;
         }
     }
 
@@ -747,7 +759,9 @@ impl<'s> Search<'s> {
         let ridge = self.ridges(&self.leader(Some(frame), 3)).unwrap_or(start);
         // Starts: the best sets of different sizes, and the simplest.
         let mut starts: Vec<Vec<usize>> = Vec::new();
-        for (low, high) in [(0, 20), (20, 50), (50, 100)] {
+        // Large ones first where they are asked for: from small ones it is a long way.
+        let large = (self.options.budget.terms > 100).then_some((100, MAX_CHAIN));
+        for (low, high) in large.into_iter().chain([(0, 20), (20, 50), (50, 100)]) {
             let best = (0..self.candidates.len())
                 .filter(|i| {
                     let c = &self.candidates[*i];
@@ -822,8 +836,8 @@ fn collect<T: Trajectories>(
 
 /// Searches the best sparse model of a robot; its own dictionary and fit are not looked at.
 ///
-/// The data are held in memory, beside the sums of every frame: about 1.3 MB for each fold and each
-/// number of lags up to five.
+/// The data are held in memory, beside the sums of every frame: about 1.3 MB, or 2.9 MB for an arm, for
+/// each fold and each number of lags up to five.
 ///
 /// # Errors
 /// [`SelectError`].
@@ -848,7 +862,9 @@ pub fn select<T: Trajectories>(
     let mut frames = Frame::all(robot);
     let mut problems = Vec::new();
     frames.retain(|frame| {
-        let problem = Problem::new(robot, frame, library(robot, frame), &data);
+        let mut terms = library(robot, frame);
+        terms.retain(|term| term.lag() <= options.budget.lag);
+        let problem = Problem::new(robot, frame, terms, &data);
         let possible = problem.is_some();
         problems.extend(problem);
         possible
@@ -1187,6 +1203,16 @@ mod tests {
         assert!(matches!(refused, Err(SelectError::Nothing { evaluated: 1.., .. })));
         let short = InMemory { trajectories: &[Trajectory::default()], ..source };
         assert!(matches!(select(&robot, &short, &options, &|_| {}), Err(SelectError::Score(_))));
+    }
+
+    #[test]
+    fn no_older_sample_is_looked_at_than_asked() {
+        let (robot, walk) = (robot(CART), bilinear());
+        let mut options = options(&robot, 200);
+        options.budget.lag = 0;
+        let found = search(&robot, &walk, &options);
+        let terms = found.candidates.iter().flat_map(|c| &c.terms);
+        assert!(terms.clone().count() > 0 && terms.clone().all(|t| !t.contains('@')));
     }
 
     #[test]
