@@ -43,7 +43,6 @@ use crate::sparse_fit::{
 pub use crate::sparse_fit::{MARGIN, Rejection};
 use crate::terms::{Names, robot_names};
 use crate::trajectory::{InMemory, Trajectories, Trajectory, collect_named};
-use firmware_core::cost::Cost;
 
 /// Frames that are searched after the screening.
 pub const FRAMES: usize = 2;
