@@ -90,7 +90,7 @@ struct RunArgs {
     #[arg(long, value_name = "FILE")]
     scenario: Option<PathBuf>,
     /// Virtual time, instead of the scenario's
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
     seconds: Option<f64>,
     /// Faults, beside the scenario's: KIND[:UNIT]@FROM..UNTIL=INTENSITY, such as slip:1@20..40=0.5
     ///

@@ -28,8 +28,9 @@ const CALIBRATION: u32 = 1_000_000;
 /// Room for the largest blob that is read from the host.
 const ROOM: usize = 48 * 1024;
 
-static MODELS: [&Aligned<[u8]>; 3] = [
+static MODELS: [&Aligned<[u8]>; 4] = [
     &Aligned(*include_bytes!("../../../models/rosbot/model.bin")),
+    &Aligned(*include_bytes!("../../../models/skid-rosbot/model.bin")),
     &Aligned(*include_bytes!("../../../models/soft-leg/model.bin")),
     &Aligned(*include_bytes!("../../../models/two-link-arm/model.bin")),
 ];

@@ -132,8 +132,13 @@ impl Default for LineSettings {
 #[non_exhaustive]
 pub enum ScenarioError {
     /// It is no TOML of a scenario.
-    #[error("{0}")]
-    Syntax(String),
+    #[error("line {line}: {message}")]
+    Syntax {
+        /// The line, from 1.
+        line: usize,
+        /// What is wrong.
+        message: String,
+    },
     /// A value is out of range.
     #[error("`{field}` must {expected}, not {found}")]
     Value {
@@ -182,8 +187,13 @@ impl Scenario {
     /// # Errors
     /// [`ScenarioError`].
     pub fn parse(text: &str, inputs: usize) -> Result<Self, ScenarioError> {
-        let scenario: Self =
-            toml::from_str(text).map_err(|e| ScenarioError::Syntax(e.to_string()))?;
+        let scenario: Self = toml::from_str(text).map_err(|e| {
+            let start = e.span().map_or(0, |span| span.start);
+            let line = 1 + text.get(..start).unwrap_or(text).matches('\n').count();
+            // A message of several lines begins with what is wrong.
+            let message = e.message().lines().next().unwrap_or_default().to_owned();
+            ScenarioError::Syntax { line, message }
+        })?;
         scenario.check(inputs)?;
         Ok(scenario)
     }
