@@ -20,11 +20,11 @@
 //! loop { wait for the timer; let start = clock.now_us(); robot.tick(start); robot.finish(clock.now_us()); }
 //! ```
 //!
-//! In [`Mode::Safe`](supervisor::Mode::Safe) and [`Mode::Idle`](supervisor::Mode::Idle) every tick
-//! switches the actuators off anew, at its beginning and at its end.
+//! In [`Mode::Safe`] and [`Mode::Idle`] every tick switches the actuators off anew, when it acts and when it
+//! ends.
 //!
-//! A loop for a robot of one's own is made of the same parts, as [`soft_leg`] shows: what is the same for
-//! every robot is in [`Supervisor`], what is left is who measures and who moves.
+//! A loop for a robot of one's own is made of the same parts, as [`soft_leg`] and docs/your-robot.md show:
+//! what is the same for every robot is in [`Supervisor`], what is left is who measures and who moves.
 
 pub mod monitor;
 pub mod rosbot;
