@@ -20,8 +20,11 @@
 //! loop { wait for the timer; let start = clock.now_us(); robot.tick(start); robot.finish(clock.now_us()); }
 //! ```
 //!
-//! In [`Mode::Safe`](supervisor::Mode::Safe) and [`Mode::Idle`](supervisor::Mode::Idle) every tick
-//! switches the actuators off anew.
+//! In [`Mode::Safe`] and [`Mode::Idle`] every tick switches the actuators off anew, when it acts and when it
+//! ends.
+//!
+//! A loop for a robot of one's own is made of the same parts, as [`soft_leg`] and docs/your-robot.md show:
+//! what is the same for every robot is in [`Supervisor`], what is left is who measures and who moves.
 
 pub mod monitor;
 pub mod rosbot;
@@ -32,9 +35,9 @@ pub mod tracker;
 
 pub use rosbot::Rosbot;
 pub use soft_leg::SoftLeg;
-pub use supervisor::{Alarms, Mode};
-pub use telemetry::Frame;
-pub use tracker::Tracker;
+pub use supervisor::{Alarms, Mode, Supervisor, Timing};
+pub use telemetry::{Frame, Telemetry};
+pub use tracker::{Measurement, Tracker};
 
 /// What the host asks for; `M` inputs in the model's order and units.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -100,49 +103,4 @@ pub(crate) fn set_share(
     // Casts to integers saturate, and NaN gives 0.
     let duty = (share.clamp(0.0, 1.0) * f32::from(pwm.max_duty_cycle()) + 0.5) as u16;
     pwm.set_duty_cycle(duty.min(pwm.max_duty_cycle())).map_err(|_| ActuatorError)
-}
-
-/// Follows a command; `sees`: the last sample had a measurement.
-pub(crate) fn follow<const M: usize>(
-    command: Command<M>,
-    supervisor: &mut supervisor::Supervisor,
-    wanted: &mut [f32; M],
-    model: &crate::Model<'_>,
-    sees: bool,
-) {
-    match command {
-        Command::Start if sees => {
-            if supervisor.mode() == Mode::Idle {
-                *wanted = [0.0; M];
-            }
-            supervisor.start();
-        }
-        Command::Start => {}
-        Command::Inputs(inputs) if inputs.iter().all(|u| u.is_finite()) => {
-            let ranges = model.structure().inputs().iter().map(|input| input.range);
-            for ((to, u), [low, high]) in wanted.iter_mut().zip(inputs).zip(ranges) {
-                // Written so that no range, however strange, makes it panic.
-                *to = u.max(low).min(high);
-            }
-            supervisor.heard();
-        }
-        Command::Inputs(_) => supervisor.raise(Alarms::BAD_COMMAND),
-        Command::Stop => supervisor.stop(),
-        Command::Reset => supervisor.reset(),
-    }
-}
-
-/// Takes what was noticed at a sample. The model is one of a robot that runs: of one whose actuators are
-/// off only the sensor is judged.
-pub(crate) fn take<const N: usize, const M: usize, const H: usize>(
-    tracked: &tracker::Tracked<N>,
-    supervisor: &mut supervisor::Supervisor,
-    tracker: &mut Tracker<'_, '_, N, M, H>,
-) {
-    if supervisor.mode() == Mode::Running {
-        supervisor.raise(tracked.alarms);
-    } else {
-        supervisor.raise(tracked.alarms & Alarms::AT_REST);
-        tracker.forget_residuals();
-    }
 }

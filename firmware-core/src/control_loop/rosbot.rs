@@ -17,7 +17,6 @@
 use embedded_hal::digital::OutputPin;
 use embedded_hal::pwm::SetDutyCycle;
 
-use crate::control_loop::soft_leg::period_us;
 use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
 use crate::control_loop::telemetry::{Frame, Telemetry};
 use crate::control_loop::tracker::{Measurement, Tracker};
@@ -42,7 +41,11 @@ impl<P: SetDutyCycle, D: OutputPin> Motor<P, D> {
         Self { pwm, backwards, reverse: None }
     }
 
-    fn apply(&mut self, share: f32) -> Result<(), ActuatorError> {
+    /// Applies a share of the supply, −1 to 1; to turn round, the duty goes to 0 first.
+    ///
+    /// # Errors
+    /// When the duty or the direction cannot be set; the direction is then set anew the next time.
+    pub fn apply(&mut self, share: f32) -> Result<(), ActuatorError> {
         let reverse = share < 0.0;
         if share != 0.0 && self.reverse != Some(reverse) {
             // A bridge that is turned round under load short-circuits the motor's own voltage.
@@ -185,9 +188,7 @@ pub struct Rosbot<'m, 'a, 'q, A, E, S, const H: usize> {
     half_sample_us: u32,
     /// What the host wants (rad/s), right and left.
     wanted: [f32; 2],
-    /// What is commanded since the last tick.
-    applied: [f32; 2],
-    /// Sum of it over the ticks since the last sample, and their number.
+    /// Sum of what was commanded over the ticks since the last sample, and their number.
     sum: [f32; 2],
     ticks: u8,
     sides: [Side; 2],
@@ -230,20 +231,18 @@ where
                 return Err(ControlLoopError::Setting { field });
             }
         }
-        let period_us = period_us(model, settings.ticks_per_sample.into())?;
-        let timing = Timing { period_us, watchdog_us: settings.watchdog_us };
+        let timing = Timing::new(model, settings.ticks_per_sample.into(), settings.watchdog_us)?;
         Ok(Self {
             actuators,
             encoders,
             sensor,
             settings,
-            period_s: period_us as f32 * 1e-6,
+            period_s: timing.period_us as f32 * 1e-6,
             tracker,
             supervisor: Supervisor::new(timing),
             telemetry,
             half_sample_us: period_us.saturating_mul(settings.ticks_per_sample.into()) / 2,
             wanted: [0.0; 2],
-            applied: [0.0; 2],
             sum: [0.0; 2],
             ticks: 0,
             sides: [Side::default(); 2],
@@ -254,13 +253,7 @@ where
 
     /// What the host asks for.
     pub fn command(&mut self, command: Command<2>) {
-        crate::control_loop::follow(
-            command,
-            &mut self.supervisor,
-            &mut self.wanted,
-            self.tracker.model(),
-            self.tracker.sees(),
-        );
+        self.supervisor.follow(command, &mut self.wanted, &self.tracker);
     }
 
     /// One tick: counts, controls the wheels' speeds, and at a sample measures, predicts and reports.
@@ -271,51 +264,33 @@ where
         let frame = (self.ticks == 0 || self.ticks >= self.settings.ticks_per_sample)
             .then(|| self.sample(now_us));
 
-        let running = self.supervisor.mode() == Mode::Running;
-        self.applied = if running { self.wanted } else { [0.0; 2] };
-        let acted = match running {
-            true => {
-                let mut shares = [0.0; 2];
-                let wheels = self.sides.iter_mut().zip(self.applied);
-                for (share, (side, command)) in shares.iter_mut().zip(wheels) {
-                    let volt = side.control(command, &self.settings, self.period_s);
-                    *share = volt / self.settings.supply_volt;
-                }
-                self.actuators.apply(shares)
+        let mut shares = [0.0; 2];
+        if self.supervisor.mode() == Mode::Running {
+            for ((share, side), command) in shares.iter_mut().zip(&mut self.sides).zip(self.wanted)
+            {
+                let volt = side.control(command, &self.settings, self.period_s);
+                *share = volt / self.settings.supply_volt;
             }
-            false => {
-                self.forget();
-                self.actuators.stop()
-            }
-        };
-        if acted.is_err() {
-            self.supervisor.raise(Alarms::ACTUATOR);
-            self.applied = [0.0; 2];
-            let _ = self.actuators.stop();
+        } else {
+            self.forget();
         }
-        for ((sum, side), command) in self.sum.iter_mut().zip(&mut self.sides).zip(self.applied) {
+        let mode = self.supervisor.act(&mut self.actuators, shares);
+        let applied = if mode == Mode::Running { self.wanted } else { [0.0; 2] };
+        for ((sum, side), command) in self.sum.iter_mut().zip(&mut self.sides).zip(applied) {
             *sum += command;
             side.deviation += side.speed - command;
         }
         self.ticks = self.ticks.saturating_add(1);
         if let Some(frame) = frame {
-            let worst_tick_us = self.supervisor.take_worst_us();
-            let noticed = self.supervisor.take_recent();
-            let (mode, alarms) = (self.supervisor.mode(), self.supervisor.alarms());
-            self.telemetry.send(Frame { mode, alarms, noticed, worst_tick_us, ..frame });
+            self.telemetry.send(self.supervisor.report(frame));
         }
-        self.supervisor.mode()
+        mode
     }
 
-    /// The tick is over: was it in time? If not, the motors go off at once.
+    /// The tick is over: was it in time? If not, or after a stop during the tick, the motors go off at
+    /// once.
     pub fn finish(&mut self, now_us: u64) -> Mode {
-        let before = self.supervisor.mode();
-        self.supervisor.finish(now_us);
-        if self.supervisor.mode() != before {
-            self.applied = [0.0; 2];
-            let _ = self.actuators.stop();
-        }
-        self.supervisor.mode()
+        self.supervisor.finish(now_us, &mut self.actuators)
     }
 
     /// Where the robot will be at the coming samples (model's units).
@@ -389,7 +364,7 @@ where
         let measured = Measurement::of(&mut self.sensor, self.half_sample_us);
         let held = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
         let tracked = self.tracker.sample(&applied, measured, &held);
-        crate::control_loop::take(&tracked, &mut self.supervisor, &mut self.tracker);
+        self.supervisor.judge(&tracked, &mut self.tracker);
         Frame::of(now_us, &applied, &tracked, self.tracker.path())
     }
 

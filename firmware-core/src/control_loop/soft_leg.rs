@@ -10,7 +10,7 @@ use embedded_hal::pwm::SetDutyCycle;
 
 use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
 use crate::control_loop::telemetry::{Frame, Telemetry};
-use crate::control_loop::tracker::{Measurement, Tracked, Tracker};
+use crate::control_loop::tracker::{Measurement, Tracker};
 use crate::control_loop::{ActuatorError, Actuators, Command, ControlLoopError, set_share};
 use crate::device::PositionSensor;
 use crate::model::Model;
@@ -133,14 +133,12 @@ where
         if !(settings.supply_volt > 0.0 && settings.supply_volt.is_finite()) {
             return Err(ControlLoopError::Setting { field: "supply_volt" });
         }
-        let period_us = period_us(model, 1)?;
-        let timing = Timing { period_us, watchdog_us: settings.watchdog_us };
         Ok(Self {
             actuators,
             sensor,
             settings,
             tracker,
-            supervisor: Supervisor::new(timing),
+            supervisor: Supervisor::new(Timing::new(model, 1, settings.watchdog_us)?),
             telemetry,
             half_sample_us: period_us / 2,
             wanted: [0.0; 2],
@@ -150,13 +148,10 @@ where
 
     /// What the host asks for.
     pub fn command(&mut self, command: Command<2>) {
-        crate::control_loop::follow(
-            command,
-            &mut self.supervisor,
-            &mut self.wanted,
-            self.tracker.model(),
-            self.tracker.sees(),
-        );
+        self.supervisor.follow(command, &mut self.wanted, &self.tracker);
+        // A model may have been trained with a larger supply: what is predicted and reported is what acts.
+        let most = self.settings.supply_volt;
+        self.wanted = self.wanted.map(|u| u.max(-most).min(most));
     }
 
     /// One tick: measures, predicts, acts, reports.
@@ -164,36 +159,24 @@ where
         self.supervisor.begin(now_us);
         let measured = Measurement::of(&mut self.sensor, self.half_sample_us);
         let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
-        let tracked: Tracked<2> = self.tracker.sample(&self.applied, measured, &next);
-        crate::control_loop::take(&tracked, &mut self.supervisor, &mut self.tracker);
-        let next = if self.supervisor.mode() == Mode::Running { next } else { [0.0; 2] };
+        let tracked = self.tracker.sample(&self.applied, measured, &next);
+        self.supervisor.judge(&tracked, &mut self.tracker);
         let frame = Frame::of(now_us, &self.applied, &tracked, self.tracker.path());
-        self.applied = next;
-        let acted = match self.supervisor.mode() {
-            Mode::Running => self.actuators.apply(next.map(|u| u / self.settings.supply_volt)),
-            Mode::Idle | Mode::Safe => self.actuators.stop(),
-        };
-        if acted.is_err() {
-            self.supervisor.raise(Alarms::ACTUATOR);
-            self.applied = [0.0; 2];
-            let _ = self.actuators.stop();
-        }
-        let worst_tick_us = self.supervisor.take_worst_us();
-        let noticed = self.supervisor.take_recent();
-        let (mode, alarms) = (self.supervisor.mode(), self.supervisor.alarms());
-        self.telemetry.send(Frame { mode, alarms, noticed, worst_tick_us, ..frame });
+        let shares = next.map(|u| u / self.settings.supply_volt);
+        let mode = self.supervisor.act(&mut self.actuators, shares);
+        self.applied = if mode == Mode::Running { next } else { [0.0; 2] };
+        self.telemetry.send(self.supervisor.report(frame));
         mode
     }
 
-    /// The tick is over: was it in time? If not, the actuators go off at once.
+    /// The tick is over: was it in time? If not, or after a stop during the tick, the actuators go off at
+    /// once.
     pub fn finish(&mut self, now_us: u64) -> Mode {
-        let before = self.supervisor.mode();
-        self.supervisor.finish(now_us);
-        if self.supervisor.mode() != before {
+        let mode = self.supervisor.finish(now_us, &mut self.actuators);
+        if mode != Mode::Running {
             self.applied = [0.0; 2];
-            let _ = self.actuators.stop();
         }
-        self.supervisor.mode()
+        mode
     }
 
     /// Where the tip will be at the coming samples (model's units).
@@ -214,17 +197,5 @@ where
     /// The devices, to look at.
     pub fn devices(&self) -> (&A, &S) {
         (&self.actuators, &self.sensor)
-    }
-}
-
-/// Ticks of `ticks` per sample of a model.
-pub(crate) fn period_us(model: &Model<'_>, ticks: u32) -> Result<u32, ControlLoopError> {
-    let sample_us = model.structure().sample_time_s() * 1e6;
-    let period_us = (sample_us / ticks as f32 + 0.5) as u32;
-    // A timer cannot tick faster, and a day is no control loop.
-    if (10..=86_400_000).contains(&period_us) {
-        Ok(period_us)
-    } else {
-        Err(ControlLoopError::Setting { field: "sample_time_s" })
     }
 }

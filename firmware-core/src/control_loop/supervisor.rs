@@ -12,6 +12,11 @@ use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use crate::control_loop::telemetry::Frame;
+use crate::control_loop::tracker::{Tracked, Tracker};
+use crate::control_loop::{Actuators, Command, ControlLoopError};
+use crate::model::Model;
+
 /// What the loop is doing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Mode {
@@ -189,6 +194,23 @@ pub struct Timing {
     pub watchdog_us: u32,
 }
 
+impl Timing {
+    /// Times of a loop with `ticks` ticks per sample of a model.
+    ///
+    /// # Errors
+    /// [`ControlLoopError::Setting`]: the period is shorter than 10 µs or longer than a day.
+    pub fn new(model: &Model<'_>, ticks: u32, watchdog_us: u32) -> Result<Self, ControlLoopError> {
+        let sample_us = model.structure().sample_time_s() * 1e6;
+        let period_us = (sample_us / ticks as f32 + 0.5) as u32;
+        // A timer cannot tick faster, and a day is no control loop.
+        if (10..=86_400_000).contains(&period_us) {
+            Ok(Self { period_us, watchdog_us })
+        } else {
+            Err(ControlLoopError::Setting { field: "sample_time_s" })
+        }
+    }
+}
+
 /// The state machine.
 ///
 /// ```
@@ -265,16 +287,97 @@ impl Supervisor {
         }
     }
 
-    /// The tick ends.
-    pub fn finish(&mut self, now_us: u64) {
-        let began_us = self.began_us.unwrap_or(now_us);
-        let Some(taken_us) = now_us.checked_sub(began_us) else {
-            return self.raise(Alarms::CLOCK);
-        };
-        self.worst_us = self.worst_us.max(u32::try_from(taken_us).unwrap_or(u32::MAX));
-        if taken_us > u64::from(self.timing.period_us) {
-            self.raise(Alarms::LATE);
+    /// Follows a command: `wanted`, in the model's units, is what a running robot does from its next
+    /// tick on.
+    pub fn follow<const N: usize, const M: usize, const H: usize>(
+        &mut self,
+        command: Command<M>,
+        wanted: &mut [f32; M],
+        tracker: &Tracker<'_, '_, N, M, H>,
+    ) {
+        match command {
+            Command::Start if tracker.sees() => {
+                if self.mode == Mode::Idle {
+                    *wanted = [0.0; M];
+                }
+                self.start();
+            }
+            Command::Start => {}
+            Command::Inputs(inputs) if inputs.iter().all(|u| u.is_finite()) => {
+                let inputs_of_model = tracker.model().structure().inputs().iter();
+                let ranges = inputs_of_model.map(|input| input.range);
+                for ((to, u), [low, high]) in wanted.iter_mut().zip(inputs).zip(ranges) {
+                    // Written so that no range, however strange, makes it panic.
+                    *to = u.max(low).min(high);
+                }
+                self.heard();
+            }
+            Command::Inputs(_) => self.raise(Alarms::BAD_COMMAND),
+            Command::Stop => self.stop(),
+            Command::Reset => self.reset(),
         }
+    }
+
+    /// Takes what was noticed at a sample. The model is one of a robot that runs: of one whose actuators
+    /// are off only the sensor is judged.
+    pub fn judge<const N: usize, const M: usize, const H: usize>(
+        &mut self,
+        tracked: &Tracked<N>,
+        tracker: &mut Tracker<'_, '_, N, M, H>,
+    ) {
+        if self.mode == Mode::Running {
+            self.raise(tracked.alarms);
+        } else {
+            self.raise(tracked.alarms & Alarms::AT_REST);
+            tracker.forget_residuals();
+        }
+    }
+
+    /// A running robot acts, any other is switched off; so is one that cannot act as it should, which
+    /// goes to Safe. The mode from here on.
+    pub fn act<const M: usize>(
+        &mut self,
+        actuators: &mut impl Actuators<M>,
+        shares: [f32; M],
+    ) -> Mode {
+        let running = self.mode == Mode::Running;
+        if running && actuators.apply(shares).is_err() {
+            self.raise(Alarms::ACTUATOR);
+        }
+        if self.mode != Mode::Running && actuators.stop().is_err() {
+            self.raise(Alarms::ACTUATOR);
+        }
+        self.mode
+    }
+
+    /// The tick ends: was it in time? A robot that is not running, because it was not or because a
+    /// command came during the tick, is switched off. The mode from here on.
+    pub fn finish<const M: usize>(
+        &mut self,
+        now_us: u64,
+        actuators: &mut impl Actuators<M>,
+    ) -> Mode {
+        let began_us = self.began_us.unwrap_or(now_us);
+        match now_us.checked_sub(began_us) {
+            None => self.raise(Alarms::CLOCK),
+            Some(taken_us) => {
+                self.worst_us = self.worst_us.max(u32::try_from(taken_us).unwrap_or(u32::MAX));
+                if taken_us > u64::from(self.timing.period_us) {
+                    self.raise(Alarms::LATE);
+                }
+            }
+        }
+        if self.mode != Mode::Running && actuators.stop().is_err() {
+            self.raise(Alarms::ACTUATOR);
+        }
+        self.mode
+    }
+
+    /// A frame with what is known here: mode, alarms, what was noticed and the longest tick since the
+    /// frame before.
+    pub fn report(&mut self, frame: Frame) -> Frame {
+        let (worst_tick_us, noticed) = (self.take_worst_us(), self.take_recent());
+        Frame { mode: self.mode, alarms: self.alarms, noticed, worst_tick_us, ..frame }
     }
 
     /// The longest tick since the last call (µs).

@@ -5,7 +5,7 @@
 //! measurement, or a missing sequence number, ends a trajectory.
 
 use heapless::Vec;
-use heapless::spsc::{Consumer, Producer};
+use heapless::spsc;
 use serde::{Deserialize, Serialize};
 
 use crate::capacity::{MAX_INPUTS, MAX_STATES};
@@ -55,8 +55,8 @@ fn list<const C: usize>(numbers: &[f32]) -> Vec<f32, C> {
 /// The sending end of the queue between a loop and its transmitter: it never waits.
 ///
 /// ```
-/// use firmware_core::control_loop::telemetry::{Frame, Telemetry};
-/// let mut queue = heapless::spsc::Queue::<Frame, 3>::new(); // room for two
+/// use firmware_core::control_loop::telemetry::{Frame, Queue, Telemetry};
+/// let mut queue = Queue::<3>::new(); // room for two
 /// let (producer, mut consumer) = queue.split();
 /// let mut telemetry = Telemetry::new(producer);
 /// for _ in 0..5 {
@@ -69,21 +69,24 @@ fn list<const C: usize>(numbers: &[f32]) -> Vec<f32, C> {
 /// assert_eq!((frame.sequence, frame.dropped), (5, 3));
 /// ```
 pub struct Telemetry<'q> {
-    queue: Producer<'q, Frame>,
+    queue: spsc::Producer<'q, Frame>,
     sequence: u32,
     dropped: u32,
 }
 
+/// The queue between a loop and its transmitter, with room for `C` − 1 frames.
+pub type Queue<const C: usize> = spsc::Queue<Frame, C>;
+
 /// The end of the queue from which frames are sent.
-pub type Frames<'q> = Consumer<'q, Frame>;
+pub type Frames<'q> = spsc::Consumer<'q, Frame>;
 
 impl<'q> Telemetry<'q> {
     /// The sending end.
-    pub fn new(queue: Producer<'q, Frame>) -> Self {
+    pub fn new(queue: spsc::Producer<'q, Frame>) -> Self {
         Self { queue, sequence: 0, dropped: 0 }
     }
 
-    /// Numbers a frame and puts it into the queue; drops it when the queue is full.
+    /// Numbers a frame, as [`Supervisor::report`](crate::control_loop::Supervisor::report) made it, and puts it into the queue; drops it when the queue is full.
     pub fn send(&mut self, frame: Frame) {
         let frame = Frame { sequence: self.sequence, dropped: self.dropped, ..frame };
         self.sequence = self.sequence.wrapping_add(1);
@@ -99,8 +102,9 @@ impl<'q> Telemetry<'q> {
 }
 
 impl Frame {
-    /// The frame of a sample.
-    pub(crate) fn of<const N: usize, const M: usize>(
+    /// The frame of a sample at `time_us`, to which the inputs `applied` led; `path` is that of the
+    /// tracker.
+    pub fn of<const N: usize, const M: usize>(
         time_us: u64,
         applied: &[f32; M],
         tracked: &Tracked<N>,

@@ -50,11 +50,9 @@ impl<const N: usize> Measurement<N> {
 /// One sample of the robot beside its model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tracked<const N: usize> {
-    /// The mean inputs since the sample before are not here: the loop knows them.
-    ///
     /// Where the model says the robot is; `None` while its history fills.
     pub predicted: Option<[f32; N]>,
-    /// Where it was measured, if the measurement was used.
+    /// Where it was measured, angles in (−π, π], if the measurement was used.
     pub measured: Option<[f32; N]>,
     /// Measured − predicted, angles on the circle; also of a measurement that was not believed.
     pub residual: Option<[f32; N]>,
@@ -73,7 +71,9 @@ pub struct Tracked<const N: usize> {
 /// ahead.
 ///
 /// What it predicts for a sample is bit by bit what `trainer evaluate` predicts on the recorded log:
-/// rolled out from the last measurement that was used, with the inputs that were applied.
+/// rolled out from the last measurement that was used, with the inputs that were applied. After a gap
+/// that holds once the model looks back at measurements only; until then the predictions in the gap
+/// stand in for them.
 #[derive(Clone, Debug)]
 pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
     predictor: Predictor<'m, 'a>,
@@ -182,7 +182,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         let taken = match measured {
             Measurement::Taken(x) if x.iter().all(|x| x.is_finite()) => {
                 self.bad = 0;
-                Some(x)
+                Some(self.turned(x))
             }
             Measurement::Missing => None,
             Measurement::Late => {
@@ -295,6 +295,17 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         let mut x = [0.0; N];
         // Of the right length: it cannot be refused.
         let _ = self.predictor.coordinates(state, &mut x);
+        x
+    }
+
+    /// Coordinates with angles in (−π, π]: sensors count turns, and the trainer wraps the angles of a
+    /// log before it narrows them to f32.
+    fn turned(&self, mut x: [f32; N]) -> [f32; N] {
+        for (x, state) in x.iter_mut().zip(self.model().structure().states()) {
+            if state.space == Space::Circle {
+                *x = x.wrap();
+            }
+        }
         x
     }
 
