@@ -14,8 +14,8 @@ use firmware_core::blob::Aligned;
 use firmware_core::control_loop::rosbot::Motor;
 use firmware_core::control_loop::telemetry::Queue;
 use firmware_core::control_loop::{
-    ActuatorError, Actuators, Alarms, Command, ControlLoopError, Frame, Measurement, Mode,
-    Supervisor, Telemetry, Timing, Tracker,
+    ActuatorError, Actuators, Alarms, Command, ControlLoopError, Frame, Mode, Supervisor,
+    Telemetry, Timing, Tracker,
 };
 use firmware_core::device::{MonotonicClock, PositionSensor};
 use firmware_sim::mcu::position_sensor::MotionCaptureSettings;
@@ -84,7 +84,7 @@ impl<'m, 'a, 'q, A: Actuators<1>, S: PositionSensor<1>> CartLoop<'m, 'a, 'q, A, 
     /// One tick: sense, predict, act, report.
     pub fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
-        let measured = Measurement::from(self.sensor.measure());
+        let measured = self.tracker.measure(&mut self.sensor);
         let mut next = self.wanted;
         let tracked = self.tracker.sample(&self.applied, measured, &next);
         self.supervisor.judge(&tracked, &mut self.tracker);

@@ -9,7 +9,7 @@ use embedded_hal::digital::{self, OutputPin};
 use embedded_hal::pwm::{self, SetDutyCycle};
 use firmware_core::Model;
 use firmware_core::blob::Aligned;
-use firmware_core::control_loop::monitor::{GATE, THRESHOLD};
+use firmware_core::control_loop::monitor::{FAR, GATE};
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
 use firmware_core::control_loop::telemetry::{Frames, Queue};
@@ -822,10 +822,10 @@ fn times_that_are_wrong_stop_a_running_robot() {
     let ahead = |us| When::After(us);
     for (begin, end, expected) in [
         (ahead(LEG_US), ahead(1000), Alarms::none()),
-        // A tick may be half a period late or early, and take a period.
-        (ahead(LEG_US + LEG_US / 2), ahead(LEG_US), Alarms::none()),
+        // A tick may be a quarter of a period late and half of one early, and take a period.
+        (ahead(LEG_US + LEG_US / 4), ahead(LEG_US), Alarms::none()),
         (ahead(LEG_US / 2), ahead(0), Alarms::none()),
-        (ahead(LEG_US + LEG_US / 2 + 1), ahead(1000), Alarms::LATE),
+        (ahead(LEG_US + LEG_US / 4 + 1), ahead(1000), Alarms::LATE),
         (ahead(LEG_US), ahead(LEG_US + 1), Alarms::LATE),
         (ahead(LEG_US / 2 - 1), ahead(1000), Alarms::CLOCK),
         (ahead(0), ahead(1000), Alarms::CLOCK),
@@ -855,9 +855,9 @@ fn times_that_are_wrong_stop_a_running_robot() {
 
 #[test]
 fn a_silent_host_stops_the_robot_by_time_or_by_ticks() {
-    // The watchdog is 1 s. By a true clock it takes 20 ticks of 50 ms, of 75 ms (late, but within
-    // what is allowed) 13; by a clock at half the speed the ticks count.
-    for (tick_us, ticks) in [(LEG_US, 20), (LEG_US * 3 / 2, 13), (LEG_US / 2, 20)] {
+    // The watchdog is 1 s. By a true clock it takes 20 ticks of 50 ms, of 62.5 ms (late, but within
+    // what is allowed) 16; by a clock at half the speed the ticks count.
+    for (tick_us, ticks) in [(LEG_US, 20), (LEG_US * 5 / 4, 16), (LEG_US / 2, 20)] {
         leg_in(Mode::Running, |robot, frames, rig, next_us| {
             robot.command(Command::Inputs([6.0, -6.0]));
             // Not followed, and no sign of life either.
@@ -872,7 +872,8 @@ fn a_silent_host_stops_the_robot_by_time_or_by_ticks() {
                 while frames.dequeue().is_some() {}
             }
             assert_eq!(robot.tick(now_us + tick_us), Mode::Safe, "{tick_us} µs");
-            assert_eq!(robot.alarms(), Alarms::HOST_SILENT | Alarms::BAD_COMMAND);
+            // This leg does not move as its model says; that does not stop it.
+            assert!(robot.alarms().contains(Alarms::HOST_SILENT | Alarms::BAD_COMMAND));
             assert!(rig.is_off());
         });
     }
@@ -1007,11 +1008,12 @@ proptest! {
         // One bound is 1 mm after one step.
         let error = if sign { ratio } else { -ratio };
         let noticed = (1..1000).find(|_| off(&mut tracker, error).alarms.contains(Alarms::RESIDUAL));
-        let promised = (THRESHOLD / excess).ceil() as i32;
+        let promised = (FAR / excess).ceil() as i32;
         // Sums are rounded, and 5 itself is not beyond 5.
-        let exact = THRESHOLD / excess;
+        let exact = FAR / excess;
         let slack = i32::from((exact - exact.round()).abs() < 1e-3 * exact);
-        prop_assert!((noticed.unwrap() - promised).abs() <= slack, "{noticed:?} {promised}");
+        // Often beyond its bound, it may be noticed before it has been far enough.
+        prop_assert!(noticed.unwrap() <= promised + slack, "{noticed:?} {promised}");
     }
 
     #[test]

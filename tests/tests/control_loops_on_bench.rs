@@ -121,7 +121,7 @@ fn bend(model: &Model<'static>, (gaps, spike): (bool, f32), seconds: u64) -> Vec
     let [input_pump, exhaust_pump] = devices.pumps;
     let actuators = Pneumatics {
         bending: Chamber { valve, line },
-        extension: Chamber { valve: other_valve, line: other_line },
+        extension: Chamber::new(other_valve, other_line),
         input_pump,
         exhaust_pump,
     };

@@ -19,7 +19,7 @@ use embedded_hal::pwm::SetDutyCycle;
 
 use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
 use crate::control_loop::telemetry::{Frame, Telemetry};
-use crate::control_loop::tracker::{Measurement, Tracker};
+use crate::control_loop::tracker::Tracker;
 use crate::control_loop::{ActuatorError, Actuators, Command, ControlLoopError, set_share};
 use crate::device::{EncoderCount, PositionSensor};
 use crate::model::Model;
@@ -185,7 +185,6 @@ pub struct Rosbot<'m, 'a, 'q, A, E, S, const H: usize> {
     tracker: Tracker<'m, 'a, 3, 2, H>,
     supervisor: Supervisor,
     telemetry: Telemetry<'q>,
-    half_sample_us: u32,
     /// What the host wants (rad/s), right and left.
     wanted: [f32; 2],
     /// Sum of what was commanded over the ticks since the last sample, and their number.
@@ -241,7 +240,6 @@ where
             tracker,
             supervisor: Supervisor::new(timing),
             telemetry,
-            half_sample_us: period_us.saturating_mul(settings.ticks_per_sample.into()) / 2,
             wanted: [0.0; 2],
             sum: [0.0; 2],
             ticks: 0,
@@ -361,7 +359,7 @@ where
             }
         }
         (self.sum, self.ticks) = ([0.0; 2], 0);
-        let measured = Measurement::of(&mut self.sensor, self.half_sample_us);
+        let measured = self.tracker.measure(&mut self.sensor);
         let held = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
         let tracked = self.tracker.sample(&applied, measured, &held);
         self.supervisor.judge(&tracked, &mut self.tracker);

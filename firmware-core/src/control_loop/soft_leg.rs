@@ -10,7 +10,7 @@ use embedded_hal::pwm::SetDutyCycle;
 
 use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
 use crate::control_loop::telemetry::{Frame, Telemetry};
-use crate::control_loop::tracker::{Measurement, Tracker};
+use crate::control_loop::tracker::Tracker;
 use crate::control_loop::{ActuatorError, Actuators, Command, ControlLoopError, set_share};
 use crate::device::PositionSensor;
 use crate::model::Model;
@@ -23,6 +23,8 @@ pub struct Chamber<V, L> {
     pub valve: V,
     /// Which pump the valve is connected with.
     pub line: L,
+    /// What the pin says, once it is known.
+    pressure: Option<bool>,
 }
 
 /// Valves and pumps of a leg.
@@ -39,16 +41,22 @@ pub struct Pneumatics<V0, L0, V1, L1, I, X> {
 }
 
 impl<V: SetDutyCycle, L: OutputPin> Chamber<V, L> {
+    /// A chamber whose pin has not been set yet.
+    pub fn new(valve: V, line: L) -> Self {
+        Self { valve, line, pressure: None }
+    }
+
     fn apply(&mut self, share: f32) -> Result<(), ActuatorError> {
-        if share == 0.0 {
-            return set_share(&mut self.valve, 0.0);
+        let pressure = share > 0.0;
+        if share != 0.0 && self.pressure != Some(pressure) {
+            // On the wrong line an open valve does the opposite: it closes first, and stays closed when the
+            // line cannot be switched.
+            self.pressure = None;
+            set_share(&mut self.valve, 0.0)?;
+            self.line.set_state(pressure.into()).map_err(|_| ActuatorError)?;
+            self.pressure = Some(pressure);
         }
-        let line = self.line.set_state((share > 0.0).into()).map_err(|_| ActuatorError);
-        match line {
-            Ok(()) => set_share(&mut self.valve, share.abs()),
-            // On the wrong line an open valve does the opposite.
-            Err(error) => set_share(&mut self.valve, 0.0).and(Err(error)),
-        }
+        set_share(&mut self.valve, share.abs())
     }
 }
 
@@ -105,7 +113,6 @@ pub struct SoftLeg<'m, 'a, 'q, A, S, const H: usize> {
     tracker: Tracker<'m, 'a, 2, 2, H>,
     supervisor: Supervisor,
     telemetry: Telemetry<'q>,
-    half_sample_us: u32,
     /// What the host wants (V).
     wanted: [f32; 2],
     /// What acts since the last tick (V).
@@ -140,7 +147,6 @@ where
             tracker,
             supervisor: Supervisor::new(Timing::new(model, 1, settings.watchdog_us)?),
             telemetry,
-            half_sample_us: period_us / 2,
             wanted: [0.0; 2],
             applied: [0.0; 2],
         })
@@ -157,7 +163,7 @@ where
     /// One tick: measures, predicts, acts, reports.
     pub fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
-        let measured = Measurement::of(&mut self.sensor, self.half_sample_us);
+        let measured = self.tracker.measure(&mut self.sensor);
         let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
         let tracked = self.tracker.sample(&self.applied, measured, &next);
         self.supervisor.judge(&tracked, &mut self.tracker);

@@ -35,18 +35,6 @@ pub enum Measurement<const N: usize> {
     Unreadable,
 }
 
-impl<const N: usize> Measurement<N> {
-    /// Asks a sensor; a measurement older than `limit_us` is [`Late`](Self::Late).
-    pub fn of(sensor: &mut impl PositionSensor<N>, limit_us: u32) -> Self {
-        match sensor.measure() {
-            Ok(Some(_)) if sensor.age_us() > limit_us => Self::Late,
-            Ok(Some(coordinates)) => Self::Taken(coordinates),
-            Ok(None) => Self::Missing,
-            Err(_) => Self::Unreadable,
-        }
-    }
-}
-
 /// One sample of the robot beside its model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tracked<const N: usize> {
@@ -142,6 +130,18 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
     /// Whether measured and predicted can be compared: the model has error bounds.
     pub fn monitored(&self) -> bool {
         self.model().error_bounds().is_some()
+    }
+
+    /// Asks a sensor. A measurement that is older than half a sample belongs to an earlier one.
+    pub fn measure(&self, sensor: &mut impl PositionSensor<N>) -> Measurement<N> {
+        // Casts to integers saturate.
+        let half_us = (self.model().structure().sample_time_s() * 0.5e6) as u32;
+        match sensor.measure() {
+            Ok(Some(_)) if sensor.age_us() > half_us => Measurement::Late,
+            Ok(Some(coordinates)) => Measurement::Taken(coordinates),
+            Ok(None) => Measurement::Missing,
+            Err(_) => Measurement::Unreadable,
+        }
     }
 
     /// Whether the last sample had a measurement that was used.

@@ -174,8 +174,8 @@ impl Rig<2> for SoftLegBench {
         let [bending_line, extension_line] = devices.lines;
         let [input_pump, exhaust_pump] = devices.pumps;
         let pneumatics = Pneumatics {
-            bending: Chamber { valve: bending, line: bending_line },
-            extension: Chamber { valve: extension, line: extension_line },
+            bending: Chamber::new(bending, bending_line),
+            extension: Chamber::new(extension, extension_line),
             input_pump,
             exhaust_pump,
         };
