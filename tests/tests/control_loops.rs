@@ -37,9 +37,17 @@ fn keep(bytes: &[u8]) -> Model<'static> {
     firmware_core::parse(&slot.0[..bytes.len()]).unwrap()
 }
 
+/// A model that comes with the project, without the error bounds that it may have.
 fn shipped(name: &str) -> Model<'static> {
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models");
-    keep(&std::fs::read(models.join(name).join("model.bin")).unwrap())
+    let model = keep(&std::fs::read(models.join(name).join("model.bin")).unwrap());
+    let (structure, coefficients, ranges) =
+        (model.structure().clone(), model.coefficients(), model.ranges());
+    match model.terms() {
+        Some(terms) => Model::new_sparse(structure, terms.entries(), coefficients, ranges),
+        None => Model::new(structure, coefficients, ranges),
+    }
+    .unwrap()
 }
 
 fn with_bounds(

@@ -30,7 +30,7 @@ fn folder(name: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../models").join(name)
 }
 
-/// The blob of a shipped model, with the bounds of a few steps if there are any.
+/// A model that comes with the project, with these bounds of 1 and of 9 steps, or with those that it has.
 fn model(name: &str, bounds: Option<&'static [f32]>) -> Model<'static> {
     const ROOM: usize = 1 << 14;
     let bytes = std::fs::read(folder(name).join("model.bin")).unwrap();
