@@ -312,8 +312,9 @@ impl<A: Actuators<2>> Actuators<2> for Checked<A> {
                 let found = h.duty[i];
                 h.misuse.push(format!("a share of {share} is a duty of {found}"));
             }
-            // Forwards is low, pressure is high.
-            if h.duty[i] != 0 && h.pins[i] != ((share > 0.0) == h.is_leg) {
+            // Forwards is low, pressure is high. A valve that cannot be closed stays on its old side until
+            // the loop stops everything, at once.
+            if result.is_ok() && h.duty[i] != 0 && h.pins[i] != ((share > 0.0) == h.is_leg) {
                 h.misuse.push(format!("output {i} is open on the wrong side"));
             }
             if h.is_leg
@@ -397,7 +398,7 @@ fn leg<T>(
     test: impl FnOnce(&mut dyn Loop, &mut Frames<'_>) -> T,
 ) -> T {
     rig.0.borrow_mut().is_leg = true;
-    let chamber = |i| Chamber { valve: Duty(rig.clone(), i), line: Level(rig.clone(), i) };
+    let chamber = |i| Chamber::new(Duty(rig.clone(), i), Level(rig.clone(), i));
     let actuators = Pneumatics {
         bending: chamber(0),
         extension: chamber(1),

@@ -120,7 +120,7 @@ fn bend(model: &Model<'static>, (gaps, spike): (bool, f32), seconds: u64) -> Vec
     let ([valve, other_valve], [line, other_line]) = (devices.valves, devices.lines);
     let [input_pump, exhaust_pump] = devices.pumps;
     let actuators = Pneumatics {
-        bending: Chamber { valve, line },
+        bending: Chamber::new(valve, line),
         extension: Chamber::new(other_valve, other_line),
         input_pump,
         exhaust_pump,

@@ -177,7 +177,9 @@ impl Selection {
         let frame = &self.frames[c.frame];
         let mut text = String::new();
         let (mut table, mut state) = (String::new(), 0);
-        for line in original.lines() {
+        // What an earlier search said of its winner is not true of this one.
+        let said = ["# Found by `trainer select`", "# cross-validated over "];
+        for line in original.lines().filter(|line| !said.iter().any(|s| line.starts_with(s))) {
             let bare = line.split('#').next().unwrap_or("").trim();
             let header = bare.trim_start_matches('[').trim_end_matches(']').trim();
             let plain = |c: char| c.is_ascii_alphanumeric() || "_-. ".contains(c);
