@@ -11,6 +11,7 @@ use firmware_sim::run::figure::Figure;
 use firmware_sim::run::live::Live;
 use firmware_sim::run::log::Logger;
 use firmware_sim::run::scenario::{FaultText, Scenario};
+use firmware_sim::run::serve::{Door, serve};
 use firmware_sim::run::summary::Summary;
 use firmware_sim::run::sweep;
 use std::error::Error;
@@ -55,6 +56,43 @@ enum Command {
     },
     Run(RunArgs),
     Sweep(SweepArgs),
+    Serve(ServeArgs),
+}
+
+/// Runs a model's robot in real time, with its serial line on a TCP port or a pseudo-terminal: a controller
+/// to talk to without hardware.
+///
+/// Says where on its first line, such as `skid-rosbot on tcp:127.0.0.1:4000`, which is what
+/// `trainer monitor --port` takes. Without --drive the client has to send the commands.
+#[derive(Args)]
+#[command(verbatim_doc_comment)]
+struct ServeArgs {
+    /// The blob
+    model: PathBuf,
+    /// Listen on this address; port 0 is a free one [default: 127.0.0.1:0]
+    #[arg(long, value_name = "ADDRESS")]
+    tcp: Option<std::net::SocketAddr>,
+    /// A new pseudo-terminal instead
+    #[arg(long, conflicts_with = "tcp")]
+    pty: bool,
+    /// Drive at random, or by the scenario
+    #[arg(long)]
+    drive: bool,
+    /// Scenario, a TOML file: faults and, with --drive, the script
+    #[arg(long, value_name = "FILE")]
+    scenario: Option<PathBuf>,
+    /// Faults, as for run
+    #[arg(long, value_name = "FAULT", value_delimiter = ',')]
+    faults: Vec<Fault>,
+    /// Seed of sensors, faults and random commands
+    #[arg(long, value_name = "K", default_value_t = 1)]
+    seed: u64,
+    /// Stop after this time of the robot [default: never]
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
+    seconds: Option<f64>,
+    /// Times as fast as reality; 0 for as fast as it goes
+    #[arg(long, value_name = "X", default_value_t = 1.0)]
+    speed: f64,
 }
 
 /// Runs a model's robot with every fault at several intensities and compares what comes of them with what
@@ -204,7 +242,7 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
     let blob = run::Blob::read(&args.model)?;
     let model = blob.model().map_err(|e| named(&e))?;
     let structure = model.structure();
-    let scenario = scenario(args, structure).map_err(|e| e.to_string())?;
+    let scenario = scenario((args.scenario.as_deref(), args.seconds, &args.faults), structure)?;
     let mut logger = args
         .log
         .as_ref()
@@ -237,7 +275,8 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
             write!(out, "\x1b[H{}", live.picture(seen, &states))?;
             out.flush()?;
             if args.speed > 0.0 {
-                let due = Duration::from_secs_f64(seen.frame.time_us as f64 * 1e-6 / args.speed);
+                let due = seen.frame.time_us as f64 * 1e-6 / args.speed;
+                let due = Duration::try_from_secs_f64(due).unwrap_or(Duration::MAX);
                 std::thread::sleep(due.saturating_sub(began.elapsed()));
             }
         }
@@ -295,16 +334,48 @@ fn sweep_model(args: &SweepArgs) -> Result<(), Box<dyn Error>> {
     }
 }
 
-fn scenario(args: &RunArgs, structure: &Structure<'_>) -> Result<Scenario, Box<dyn Error>> {
+/// Virtual time of a controller that is served without an end (s): a hundred years.
+const NO_END_S: f64 = 3e9;
+
+fn serve_model(args: &ServeArgs) -> Result<(), Box<dyn Error>> {
+    let named = |error: &dyn std::fmt::Display| format!("{}: {error}", args.model.display());
+    let blob = run::Blob::read(&args.model)?;
+    let model = blob.model().map_err(|e| named(&e))?;
+    let structure = model.structure();
+    let seconds = Some(args.seconds.unwrap_or(NO_END_S));
+    let scenario = scenario((args.scenario.as_deref(), seconds, &args.faults), structure)?;
+    let door = match args.pty {
+        #[cfg(unix)]
+        true => Door::pty().map_err(|e| format!("there is no pseudo-terminal: {e}"))?,
+        #[cfg(not(unix))]
+        true => return Err("there are no pseudo-terminals here; use --tcp".into()),
+        false => {
+            let address = args.tcp.unwrap_or_else(|| ([127, 0, 0, 1], 0).into());
+            Door::tcp(address).map_err(|e| format!("cannot listen on {address}: {e}"))?
+        }
+    };
+    let mut out = std::io::stdout();
+    writeln!(out, "{} on {}", structure.robot(), door.name()?)?;
+    out.flush()?;
+    let summary = serve(&model, &scenario, args.seed, door, (args.drive, args.speed));
+    let summary = summary.map_err(|e| named(&e))?;
+    write!(out, "{}", summary.text())?;
+    Ok(())
+}
+
+fn scenario(
+    (path, seconds, faults): (Option<&Path>, Option<f64>, &[Fault]),
+    structure: &Structure<'_>,
+) -> Result<Scenario, Box<dyn Error>> {
     let robot = run::Robot::of(structure)?;
-    let mut scenario = match &args.scenario {
+    let mut scenario = match path {
         Some(path) => Scenario::load(path, structure.inputs().len())?,
         None => Scenario::random(robot.limit()),
     };
-    if let Some(seconds) = args.seconds {
+    if let Some(seconds) = seconds {
         scenario.seconds = seconds;
     }
-    scenario.faults.extend(args.faults.iter().copied().map(FaultText));
+    scenario.faults.extend(faults.iter().copied().map(FaultText));
     scenario.check(structure.inputs().len())?;
     Ok(scenario)
 }
@@ -324,6 +395,7 @@ fn run(arguments: Arguments) -> Result<(), Box<dyn Error>> {
     match arguments.command {
         Command::Run(args) => run_model(&args)?,
         Command::Sweep(args) => sweep_model(&args)?,
+        Command::Serve(args) => serve_model(&args)?,
         Command::Record { set: Some(LogSet::Paper { seed, out, overwrite }), .. } => {
             let logs = PaperLogs::new(seed);
             logs.write(&out, overwrite)?;

@@ -15,6 +15,7 @@
 //! | [`summary`] | what a run showed |
 //! | [`log`] | the telemetry as logs for the trainer |
 //! | [`figure`], [`live`] | predicted beside measured: a plot, and a view in the terminal |
+//! | [`serve`] | the same in real time, for a client on a port |
 //! | [`sweep`] | every fault on every robot, against what is expected |
 
 pub mod figure;
@@ -23,13 +24,15 @@ pub mod live;
 pub mod log;
 mod rig;
 pub mod scenario;
+pub mod serve;
 pub mod summary;
 pub mod sweep;
 
 use crate::bench::{RosbotBench, SoftLegBench};
 use crate::fault::{FaultKind, Faults};
+use crate::faulty::FaultyHost;
 use crate::mcu::misuse::Misuse;
-use crate::mcu::uart::{self, UartSettings};
+use crate::mcu::uart::{self, UartEnd, UartSettings};
 use crate::mcu::{BrownOutDetector, Wire};
 use firmware_core::control_loop::telemetry::{Frame, Telemetry};
 use firmware_core::control_loop::{ControlLoopError, Mode};
@@ -37,6 +40,7 @@ use firmware_core::link::Port;
 use firmware_core::model::{Model, Structure};
 use firmware_core::{blob, cost};
 use heapless::spsc::Queue;
+use host::{Alone, Host, Laptop};
 use rig::{Firmware, Rig};
 use scenario::{Controller, Scenario};
 use std::collections::VecDeque;
@@ -209,9 +213,26 @@ pub fn run(
 ) -> Result<Summary, RunError> {
     let robot = Robot::of(model.structure())?;
     scenario.check(model.structure().inputs().len())?;
+    let laptop = |end, faults: &Faults| Alone {
+        end: FaultyHost::new(end, faults),
+        host: Host::new(scenario, robot.tick_us(), seed),
+    };
+    with(model, robot, scenario, seed, laptop, watcher)
+}
+
+/// Runs a model with somebody at the other end of the line.
+fn with<L: Laptop>(
+    model: &Model<'_>,
+    robot: Robot,
+    scenario: &Scenario,
+    seed: u64,
+    laptop: impl FnOnce(UartEnd, &Faults) -> L,
+    watcher: &mut Watcher<'_>,
+) -> Result<Summary, RunError> {
+    let run = (robot, scenario, seed);
     match robot {
-        Robot::Rosbot => run_rig::<RosbotBench, 3>(model, robot, scenario, seed, watcher),
-        Robot::SoftLeg => run_rig::<SoftLegBench, 2>(model, robot, scenario, seed, watcher),
+        Robot::Rosbot => run_rig::<RosbotBench, L, 3>(model, run, laptop, watcher),
+        Robot::SoftLeg => run_rig::<SoftLegBench, L, 2>(model, run, laptop, watcher),
     }
 }
 
@@ -222,11 +243,10 @@ struct Then<const N: usize> {
     path: Vec<f32>,
 }
 
-fn run_rig<R: Rig<N>, const N: usize>(
+fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     model: &Model<'_>,
-    robot: Robot,
-    scenario: &Scenario,
-    seed: u64,
+    (robot, scenario, seed): (Robot, &Scenario, u64),
+    laptop: impl FnOnce(UartEnd, &Faults) -> L,
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
     let mut rig = R::new();
@@ -239,7 +259,7 @@ fn run_rig<R: Rig<N>, const N: usize>(
         ..UartSettings::default()
     };
     let (host_end, mut serial) = uart::pair(&clock, line, seed);
-    let mut host = host::Host::new(host_end, &faults, scenario, R::TICK_US, seed);
+    let mut host = laptop(host_end, &faults);
     let supply = Wire::new(SUPPLY_VOLT);
     let mut detector = BrownOutDetector::new(&supply, BROWN_OUT_VOLT, 0.1);
 
@@ -269,7 +289,7 @@ fn run_rig<R: Rig<N>, const N: usize>(
             rig.advance_us(due_us.saturating_sub(now_us));
             rig.apply(&faults);
             supply.set(SUPPLY_VOLT * (1.0 - faults.act(FaultKind::BrownOut, None).unwrap_or(0.0)));
-            let seen = host.turn(clock.now_ns() / 1000, |frame| {
+            let seen = host.turn(clock.now_ns() / 1000, &mut |frame| {
                 while pending.front().is_some_and(|then| then.time_us < frame.time_us) {
                     pending.pop_front();
                 }

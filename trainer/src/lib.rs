@@ -18,6 +18,7 @@
 //! | [`reproduce`], [`convergence`], [`figures`], [`plot`] | the paper's experiments, tables and figures |
 //! | [`report`], [`inspect`], [`spectrum_report`], [`terms`] | what the commands print |
 //! | [`topology`] | lifting functions of a topology, as in the paper's table |
+//! | [`monitor`] | a controller's telemetry, live and recorded |
 //! | [`resample`] | logs on a regular time grid |
 
 pub mod arx;
@@ -36,6 +37,7 @@ pub mod hermite;
 pub mod inspect;
 pub mod koopman;
 pub mod library;
+pub mod monitor;
 mod paper;
 mod paper_report;
 pub mod plot;

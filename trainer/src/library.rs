@@ -8,6 +8,7 @@
 use std::collections::BTreeMap;
 
 use firmware_core::capacity::{MAX_BASIS, MAX_BLOCKS, MAX_INPUTS, MAX_OBSERVABLES, MAX_STATES};
+use firmware_core::cost::Cost;
 use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source, fourier};
 use firmware_core::model::{
     Input, ModelError, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
@@ -16,7 +17,6 @@ use firmware_core::{Number, SparseTerms};
 
 use crate::robot::Robot;
 use crate::terms::Names;
-use firmware_core::cost::Cost;
 
 /// Terms of a library, the constant not counted.
 pub const MAX_LIBRARY: usize = 400;

@@ -1,9 +1,10 @@
 //! The command `trainer`: logs in, a model for the controller out.
 
 use std::fmt::Display;
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::{Duration, Instant};
 
 use clap::{Args, Parser, Subcommand};
 use firmware_core::blob;
@@ -17,6 +18,7 @@ use trainer::export::{controller_coefficients, export, write_whole};
 use trainer::figures;
 use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
+use trainer::monitor::{Port, Recorder, listen, picture};
 use trainer::recording::{LogColumn, LogSchema, Recording, Visitor};
 use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
 use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
@@ -50,6 +52,7 @@ enum Command {
     Dictionary(DictionaryArgs),
     Resample(ResampleArgs),
     Reproduce(ReproduceArgs),
+    Monitor(MonitorArgs),
 }
 
 /// Fit the model of a robot to its logs, score it on held-out trajectories, and write the blob.
@@ -301,6 +304,28 @@ struct ReproduceArgs {
     json: bool,
 }
 
+/// Listen to a controller: show its telemetry, and record it as logs that `fit` reads.
+///
+/// A new log begins whenever a frame is missing, a measurement is missing, or the robot has stopped.
+#[derive(Args)]
+struct MonitorArgs {
+    /// Serial device, pseudo-terminal, or tcp:HOST:PORT.
+    #[arg(long, value_name = "PORT")]
+    port: String,
+    /// The robot's folder, or its robot.toml: names and units of what the controller tells.
+    #[arg(long, value_name = "FILE")]
+    robot: PathBuf,
+    /// New folder for the logs.
+    #[arg(long, value_name = "DIR")]
+    record: Option<PathBuf>,
+    /// Stop after this time [default: when the line is closed, or at Ctrl-C; what was recorded is there].
+    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    seconds: Option<u32>,
+    /// Bits per second of a serial device.
+    #[arg(long, value_name = "N", default_value_t = 576_000, value_parser = clap::value_parser!(u32).range(300..=20_000_000))]
+    baud: u32,
+}
+
 /// A message for the user.
 struct Failure(String);
 
@@ -314,6 +339,7 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Fit(args) => fit(&args),
         Command::Evaluate(args) => evaluate(&args),
+        Command::Monitor(args) => monitor(&args),
         Command::Inspect(args) => show_blob(&args),
         Command::Calibrate(args) => calibrate(&args),
         Command::Stability(args) => stability(&args),
@@ -827,7 +853,7 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
             {
                 bar.set_style(style);
             }
-            bar.enable_steady_tick(std::time::Duration::from_millis(200));
+            bar.enable_steady_tick(Duration::from_millis(200));
             let cross =
                 CrossResiduals::measure(&robot, &trajectories, options.horizon, least, &|fold| {
                     bar.set_position(fold as u64)
@@ -896,6 +922,58 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
         Some(Ok(None)) | None => {}
     }
     print(&text)
+}
+
+fn monitor(args: &MonitorArgs) -> Result<(), Failure> {
+    let robot = Robot::load(&args.robot)?;
+    let mut port = Port::open(&args.port, args.baud)?;
+    let failed = |dir: &Path, e: std::io::Error| Failure(format!("{}: {e}", dir.display()));
+    let mut recorder = match &args.record {
+        Some(dir) => Some(Recorder::new(dir, &robot).map_err(|e| failed(dir, e))?),
+        None => None,
+    };
+    let live = std::io::stdout().is_terminal();
+    if live {
+        write!(std::io::stdout(), "\x1b[2J")?;
+    }
+    let until = args.seconds.map(|s| Instant::now() + Duration::from_secs(s.into()));
+    let heard = listen(&mut port, &robot, until, &mut |frame, _| {
+        if let Some(recorder) = &mut recorder {
+            recorder.frame(frame)?;
+        }
+        if live {
+            let mut out = std::io::stdout().lock();
+            write!(out, "\x1b[H{}", picture(frame, &robot))?;
+            out.flush()?;
+        }
+        Ok(())
+    });
+    let heard = heard.map_err(|e| format!("{}: {e}", args.port))?;
+    let mut text = format!(
+        "{} frames, {} missing, {} damaged\n",
+        grouped(heard.frames),
+        grouped(heard.lost),
+        grouped(heard.damaged)
+    );
+    if heard.strange > 0 {
+        text += &format!(
+            "{} frames had other states or inputs than {}: is this the right robot?\n",
+            grouped(heard.strange),
+            robot.name
+        );
+    }
+    if let (Some(recorder), Some(dir)) = (&recorder, &args.record) {
+        let (episodes, rows) = recorder.written();
+        text += &format!("{}: {episodes} logs, {} rows\n", dir.display(), grouped(rows));
+    }
+    print(&text)?;
+    if heard.frames == 0 {
+        return Err(Failure(format!(
+            "{}: nothing was heard of a robot like {}; is the controller running, at {} baud?",
+            args.port, robot.name, args.baud
+        )));
+    }
+    Ok(())
 }
 
 /// Reads logs for their checksum alone.
@@ -1157,7 +1235,7 @@ fn reproduce_paper(args: &ReproduceArgs) -> Result<(), Failure> {
     if let Ok(style) = ProgressStyle::with_template("{wide_bar} {pos}/{len} {elapsed} {msg:40}") {
         bar.set_style(style);
     }
-    bar.enable_steady_tick(std::time::Duration::from_millis(200));
+    bar.enable_steady_tick(Duration::from_millis(200));
     let results = reproduce::run(&args.dir, &methods, &|done, total, next| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
@@ -1221,7 +1299,7 @@ fn select_model(args: &SelectArgs) -> Result<(), Failure> {
             terms: args.max_terms.or(described.max_terms).map_or(default.terms, |n| n as usize),
             lag: args.max_lag.or(described.max_lag).map_or(default.lag, |n| n as usize),
             candidates: args.max_candidates.map_or(default.candidates, |n| n as usize),
-            time: std::time::Duration::from_secs(args.time_limit.into()),
+            time: Duration::from_secs(args.time_limit.into()),
         },
         score: robot.score.clone(),
         threads: args.threads.into(),

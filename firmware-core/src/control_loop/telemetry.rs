@@ -124,3 +124,75 @@ impl Frame {
         }
     }
 }
+
+/// A row of a log.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Row {
+    /// Its number within its trajectory; 0 begins a new one.
+    pub number: u64,
+    /// Coordinates as measured.
+    pub measured: Vec<f32, MAX_STATES>,
+    /// Inputs that act until the next row.
+    pub inputs: Vec<f32, MAX_INPUTS>,
+}
+
+/// Turns frames into the rows of a log.
+///
+/// Only the running robot makes rows: one that coasts to a stop after its actuators were switched off
+/// moves as no input says. A frame that is missing, is not a sample time after the one before, or has no
+/// measurement ends a trajectory.
+///
+/// ```
+/// use firmware_core::control_loop::Mode;
+/// use firmware_core::control_loop::telemetry::{Frame, Rows};
+/// let frame = |sequence: u32, applied: f32, measured: f32| Frame {
+///     sequence,
+///     time_us: 100_000 * u64::from(sequence),
+///     mode: Mode::Running,
+///     applied: [applied].into_iter().collect(),
+///     measured: [measured].into_iter().collect(),
+///     ..Frame::default()
+/// };
+/// let mut rows = Rows::new(100_000, u64::MAX);
+/// assert_eq!(rows.frame(&frame(7, 0.0, 1.0)), None); // what acts from here on is not known yet
+/// let row = rows.frame(&frame(8, 2.0, 1.5)).unwrap();
+/// assert_eq!((row.number, row.measured[0], row.inputs[0]), (0, 1.0, 2.0));
+/// assert_eq!(rows.frame(&frame(9, 3.0, 1.8)).unwrap().number, 1);
+/// assert_eq!(rows.frame(&frame(11, 3.0, 2.0)), None); // frame 10 is missing
+/// assert_eq!(rows.frame(&frame(12, 4.0, 2.2)).unwrap().number, 0);
+/// ```
+#[derive(Clone, Debug)]
+pub struct Rows {
+    sample_us: u64,
+    most: u64,
+    /// The frame whose inputs the next one tells, and the number of its row.
+    last: Option<(Frame, u64)>,
+}
+
+impl Rows {
+    /// Rows of samples of `sample_us` (µs); after `most` of them a new trajectory begins.
+    pub fn new(sample_us: u32, most: u64) -> Self {
+        Self { sample_us: sample_us.into(), most, last: None }
+    }
+
+    /// Takes a frame; the row of the one before it.
+    pub fn frame(&mut self, frame: &Frame) -> Option<Row> {
+        let before = self.last.take().filter(|(last, _)| {
+            // A fiftieth of a sample is more than any clock is off.
+            let step_us = frame.time_us.checked_sub(last.time_us);
+            last.sequence.wrapping_add(1) == frame.sequence
+                && step_us.is_some_and(|us| us.abs_diff(self.sample_us) < self.sample_us / 50)
+        });
+        // Its inputs acted also when the loop has just stopped.
+        let row = before.map(|(last, number)| Row {
+            number,
+            measured: last.measured,
+            inputs: frame.applied.clone(),
+        });
+        if frame.mode == Mode::Running && !frame.measured.is_empty() {
+            let next = row.as_ref().map_or(0, |row| row.number.saturating_add(1));
+            self.last = Some((frame.clone(), if next < self.most { next } else { 0 }));
+        }
+        row
+    }
+}

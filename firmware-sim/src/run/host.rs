@@ -1,13 +1,11 @@
 //! The laptop at the other end of the line.
 
-use crate::fault::Faults;
-use crate::faulty::FaultyHost;
-use crate::mcu::uart::UartEnd;
 use crate::run::scenario::{Scenario, Script};
 use embedded_io::{Read, ReadReady, Write};
 use firmware_core::control_loop::telemetry::Frame;
 use firmware_core::control_loop::{Command, Mode};
 use firmware_core::link::{MAX_FRAME, Message, Received, Receiver, encode};
+use std::io;
 
 /// Time between two commands (µs).
 const COMMAND_US: u64 = 50_000;
@@ -25,9 +23,47 @@ pub(crate) struct Counts {
     pub(crate) damaged: u64,
 }
 
+/// Whoever is at the host's end of the line.
+pub(crate) trait Laptop {
+    /// Takes what arrived, `frame` each frame, and sends what is due.
+    fn turn(
+        &mut self,
+        now_us: u64,
+        frame: &mut dyn FnMut(&Frame) -> io::Result<()>,
+    ) -> io::Result<()>;
+
+    /// What reached it.
+    fn counts(&self) -> Counts;
+}
+
+/// A host by itself.
+pub(crate) struct Alone<E> {
+    pub(crate) end: E,
+    pub(crate) host: Host,
+}
+
+impl<E: Read + ReadReady + Write> Laptop for Alone<E> {
+    fn turn(
+        &mut self,
+        now_us: u64,
+        frame: &mut dyn FnMut(&Frame) -> io::Result<()>,
+    ) -> io::Result<()> {
+        let mut bytes = [0; 256];
+        while matches!(self.end.read_ready(), Ok(true)) {
+            let count = self.end.read(&mut bytes).unwrap_or(0);
+            self.host.hear(&bytes[..count], frame)?;
+        }
+        self.host.speak(now_us, &mut self.end);
+        Ok(())
+    }
+
+    fn counts(&self) -> Counts {
+        self.host.counts()
+    }
+}
+
 /// Sends the script, starts the robot, and takes frames.
 pub(crate) struct Host {
-    end: FaultyHost<UartEnd>,
     receiver: Receiver,
     script: Script,
     restart: bool,
@@ -41,16 +77,9 @@ pub(crate) struct Host {
 }
 
 impl Host {
-    pub(crate) fn new(
-        end: UartEnd,
-        faults: &Faults,
-        scenario: &Scenario,
-        tick_us: u64,
-        seed: u64,
-    ) -> Self {
+    pub(crate) fn new(scenario: &Scenario, tick_us: u64, seed: u64) -> Self {
         let period_us = COMMAND_US.max(tick_us);
         Self {
-            end: FaultyHost::new(end, faults),
             receiver: Receiver::new(),
             script: Script::new(scenario, period_us as f64 * 1e-6, seed),
             restart: scenario.restart,
@@ -68,43 +97,44 @@ impl Host {
         self.counts
     }
 
-    /// Takes what arrived, then sends what is due.
-    pub(crate) fn turn(
+    /// Takes bytes from the line.
+    pub(crate) fn hear(
         &mut self,
-        now_us: u64,
-        mut frame: impl FnMut(&Frame) -> std::io::Result<()>,
-    ) -> std::io::Result<()> {
-        let mut bytes = [0; 256];
-        while matches!(self.end.read_ready(), Ok(true)) {
-            let count = self.end.read(&mut bytes).unwrap_or(0);
-            for byte in &bytes[..count] {
-                match self.receiver.push(*byte) {
-                    Some(Received::Message(Message::Frame(received))) => {
-                        self.take(&received);
-                        frame(&received)?;
-                    }
-                    Some(_) => self.counts.damaged += 1,
-                    None => {}
+        bytes: &[u8],
+        frame: &mut dyn FnMut(&Frame) -> io::Result<()>,
+    ) -> io::Result<()> {
+        for byte in bytes {
+            match self.receiver.push(*byte) {
+                Some(Received::Message(Message::Frame(received))) => {
+                    self.take(&received);
+                    frame(&received)?;
                 }
+                Some(_) => self.counts.damaged += 1,
+                None => {}
             }
-        }
-        if now_us >= self.due_us {
-            self.due_us += COMMAND_US;
-            if now_us >= self.ask_us {
-                let asked = match self.mode {
-                    Mode::Idle if !self.started || self.restart => Some(Message::Start),
-                    Mode::Safe if self.restart => Some(Message::Reset),
-                    _ => None,
-                };
-                if let Some(message) = asked {
-                    self.ask_us = now_us + AGAIN_US;
-                    self.send(&message);
-                }
-            }
-            let inputs = self.script.next();
-            self.send(&Command::Inputs(inputs).into());
         }
         Ok(())
+    }
+
+    /// Sends what is due.
+    pub(crate) fn speak(&mut self, now_us: u64, end: &mut impl Write) {
+        if now_us < self.due_us {
+            return;
+        }
+        self.due_us += COMMAND_US;
+        if now_us >= self.ask_us {
+            let asked = match self.mode {
+                Mode::Idle if !self.started || self.restart => Some(Message::Start),
+                Mode::Safe if self.restart => Some(Message::Reset),
+                _ => None,
+            };
+            if let Some(message) = asked {
+                self.ask_us = now_us + AGAIN_US;
+                send(end, &message);
+            }
+        }
+        let inputs = self.script.next();
+        send(end, &Command::Inputs(inputs).into());
     }
 
     fn take(&mut self, frame: &Frame) {
@@ -122,11 +152,11 @@ impl Host {
         }
         self.next_sequence = Some(frame.sequence.wrapping_add(1));
     }
+}
 
-    fn send(&mut self, message: &Message) {
-        let mut bytes = [0; MAX_FRAME];
-        let length = encode(message, &mut bytes).expect("there is room for every message");
-        // A full line is a command lost, as on a real one.
-        let _ = self.end.write(&bytes[..length]);
-    }
+fn send(end: &mut impl Write, message: &Message) {
+    let mut bytes = [0; MAX_FRAME];
+    let length = encode(message, &mut bytes).expect("there is room for every message");
+    // A full line is a command lost, as on a real one.
+    let _ = end.write(&bytes[..length]);
 }

@@ -1,9 +1,7 @@
 //! Telemetry as logs for the trainer: a CSV file per stretch of frames without a gap.
-//!
-//! Only the running robot is logged: one that coasts to a stop after its motors were switched off moves
-//! as no input says.
 
-use firmware_core::control_loop::{Frame, Mode};
+use firmware_core::control_loop::Frame;
+use firmware_core::control_loop::telemetry::Rows;
 use firmware_core::model::Structure;
 use std::fmt::Write as _;
 use std::fs::{self, File};
@@ -15,13 +13,10 @@ use std::path::{Path, PathBuf};
 pub struct Logger {
     folder: PathBuf,
     header: String,
-    sample_us: u64,
-    /// Most rows of a file.
-    most_rows: u64,
+    sample_us: u32,
+    rows: Rows,
     file: Option<BufWriter<File>>,
     episodes: u32,
-    /// The frame whose inputs the next one tells, and its number within its episode.
-    last: Option<(Frame, u64)>,
 }
 
 impl Logger {
@@ -59,19 +54,21 @@ impl Logger {
         let states = structure.states().iter().map(|s| (s.name, s.unit));
         let inputs = structure.inputs().iter().map(|u| (u.name, u.unit));
         for (name, unit) in states.chain(inputs) {
-            let unit = unit.replace('/', "p");
-            let _ = write!(header, ",{name}_{unit}");
+            // As the trainer names columns: `/` is a p, other signs are left out.
+            let unit = unit.replace('/', "p").replace(|c: char| !c.is_alphanumeric(), "");
+            let separator = if unit.is_empty() { "" } else { "_" };
+            let _ = write!(header, ",{name}{separator}{unit}");
         }
         header.push('\n');
-        let sample_us = (f64::from(structure.sample_time_s()) * 1e6).round() as u64;
+        let sample_us = (f64::from(structure.sample_time_s()) * 1e6).round() as u32;
+        let most = seconds.map_or(u64::MAX, |s| u64::from(s) * 1_000_000 / u64::from(sample_us));
         Ok(Self {
             folder: folder.to_owned(),
             header,
             sample_us,
-            most_rows: seconds.map_or(u64::MAX, |s| (u64::from(s) * 1_000_000 / sample_us).max(1)),
+            rows: Rows::new(sample_us, most.max(1)),
             file: None,
             episodes: 0,
-            last: None,
         })
     }
 
@@ -85,32 +82,8 @@ impl Logger {
     /// # Errors
     /// Those of the file system.
     pub fn frame(&mut self, frame: &Frame) -> io::Result<()> {
-        let usable = frame.mode == Mode::Running && !frame.measured.is_empty();
-        let goes_on = |last: &Frame| {
-            last.sequence.wrapping_add(1) == frame.sequence
-                && frame
-                    .time_us
-                    .checked_sub(last.time_us)
-                    .is_some_and(|us| us.abs_diff(self.sample_us) < self.sample_us / 50)
-        };
-        let row = match self.last.take() {
-            // Its inputs acted also when the loop has just stopped.
-            Some((last, row)) if goes_on(&last) => {
-                self.write(&last, frame, row)?;
-                if row + 1 < self.most_rows { row + 1 } else { 0 }
-            }
-            _ => 0,
-        };
-        if usable {
-            self.last = Some((frame.clone(), row));
-        } else {
-            self.finish()?;
-        }
-        Ok(())
-    }
-
-    fn write(&mut self, last: &Frame, next: &Frame, row: u64) -> io::Result<()> {
-        if row == 0 {
+        let Some(row) = self.rows.frame(frame) else { return Ok(()) };
+        if row.number == 0 {
             self.finish()?;
             let path = self.folder.join(format!("episode-{:03}.csv", self.episodes));
             let mut file = BufWriter::new(File::create(path)?);
@@ -120,8 +93,8 @@ impl Logger {
         }
         let Some(file) = &mut self.file else { return Ok(()) };
         // The clock's own time: f64 from whole microseconds.
-        write!(file, "{}", (row * self.sample_us) as f64 / 1e6)?;
-        for number in last.measured.iter().chain(&next.applied) {
+        write!(file, "{}", (row.number * u64::from(self.sample_us)) as f64 / 1e6)?;
+        for number in row.measured.iter().chain(&row.inputs) {
             // The shortest decimal that reads back as the same f32.
             write!(file, ",{number}")?;
         }
