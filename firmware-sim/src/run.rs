@@ -50,9 +50,9 @@ const SUPPLY_VOLT: f64 = 3.3;
 const BROWN_OUT_VOLT: f64 = 2.7;
 /// Frames that wait to be sent.
 const QUEUE: usize = 8;
-/// Samples whose frames may be on their way: more than fit into queue and line. On a dead line the oldest
-/// are forgotten.
-const MOST_PENDING: usize = 64;
+/// Samples whose frames may be on their way, which is enough for a line of 100 baud. On a dead line the
+/// oldest are forgotten.
+const MOST_PENDING: usize = 4_096;
 
 /// A robot that can be run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
