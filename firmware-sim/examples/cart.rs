@@ -85,7 +85,8 @@ impl<'m, 'a, 'q, A: Actuators<1>, S: PositionSensor<1>> CartLoop<'m, 'a, 'q, A, 
     pub fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
         let measured = self.tracker.measure(&mut self.sensor);
-        let mut next = self.wanted;
+        let is_running = self.supervisor.mode() == Mode::Running;
+        let mut next = if is_running { self.wanted } else { [0.0] };
         let tracked = self.tracker.sample(&self.applied, measured, &next);
         self.supervisor.judge(&tracked, &mut self.tracker);
 

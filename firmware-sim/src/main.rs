@@ -147,7 +147,7 @@ struct RunArgs {
     #[arg(long, conflicts_with = "json")]
     live: bool,
     /// With --live: times as fast as reality; 0 for as fast as it goes
-    #[arg(long, value_name = "X", default_value_t = 1.0, requires = "live")]
+    #[arg(long, value_name = "X", default_value_t = 1.0, requires = "live", allow_negative_numbers = true, value_parser = speed)]
     speed: f64,
     /// Write a plot of predicted beside measured, SVG
     #[arg(long, value_name = "FILE")]
@@ -224,6 +224,15 @@ struct RobotLogs {
     /// Replace a recording that DIR already holds
     #[arg(long)]
     overwrite: bool,
+}
+
+/// Times as fast as reality, or 0.
+fn speed(text: &str) -> Result<f64, String> {
+    let speed: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    match speed == 0.0 || (1e-3..=1e9).contains(&speed) {
+        true => Ok(speed),
+        false => Err("expected 0, or 0.001 to 1e9".to_owned()),
+    }
 }
 
 fn main() -> ExitCode {

@@ -54,6 +54,9 @@ const SUPPLY_VOLT: f64 = 3.3;
 const BROWN_OUT_VOLT: f64 = 2.7;
 /// Frames that wait to be sent.
 const QUEUE: usize = 8;
+/// Samples whose frames may be on their way, which is enough for a line of 100 baud. On a dead line the
+/// oldest are forgotten.
+const MOST_PENDING: usize = 4_096;
 
 /// A robot that can be run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -171,8 +174,16 @@ pub enum RunError {
         /// Its inputs.
         inputs: String,
     },
+    /// The model has another sample time than the loop.
+    #[error("the model's sample time is {found_s} s, the robot's loop has one of {expected_s} s")]
+    SampleTime {
+        /// That of the robot (s).
+        expected_s: f64,
+        /// That of the model (s).
+        found_s: f32,
+    },
     /// The firmware refuses the model.
-    #[error("the control loop refuses the model: {0:?}; its sample time must be that of the robot")]
+    #[error("the control loop refuses the model: {0:?}")]
     Firmware(ControlLoopError),
     /// The scenario makes no sense.
     #[error(transparent)]
@@ -249,6 +260,11 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     laptop: impl FnOnce(UartEnd, &Faults) -> L,
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
+    let expected_s = (R::TICK_US * R::TICKS_PER_SAMPLE) as f64 / 1e6;
+    let found_s = model.structure().sample_time_s();
+    if (f64::from(found_s) - expected_s).abs() > 1e-3 * expected_s {
+        return Err(RunError::SampleTime { expected_s, found_s });
+    }
     let mut rig = R::new();
     let clock = rig.clock();
     let faults = Faults::new(&clock, scenario.faults.iter().map(|fault| fault.0), seed);
@@ -325,6 +341,9 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             firmware.tick(began_us);
             if is_sample {
                 let path: Vec<f32> = firmware.path().iter().flatten().copied().collect();
+                if pending.len() == MOST_PENDING {
+                    pending.pop_front();
+                }
                 pending.push_back(Then { time_us: began_us, truth, path });
                 history += 1;
             }

@@ -1,6 +1,7 @@
 //! Runs on the simulated controller.
 
 use firmware_core::blob::Aligned;
+use firmware_core::control_loop::Alarms;
 use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
 use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
@@ -85,7 +86,7 @@ fn faults_end_as_expected() {
 }
 
 /// A model of the ROSbot with 4,096 terms: the powers up to 7 of four inputs.
-fn large() -> (Structure<'static>, Vec<f32>) {
+fn large(sample_time_s: f32) -> (Structure<'static>, Vec<f32>) {
     let state = |name, unit, space| State {
         name,
         unit,
@@ -97,7 +98,7 @@ fn large() -> (Structure<'static>, Vec<f32>) {
     let inputs = [(0, 0), (1, 0), (0, 2), (1, 2)];
     let structure = Structure::try_from(ModelRepr {
         robot: "large",
-        sample_time_s: 0.1,
+        sample_time_s,
         states: [
             state("x", "m", Space::Line),
             state("y", "m", Space::Line),
@@ -124,7 +125,7 @@ fn large() -> (Structure<'static>, Vec<f32>) {
 
 #[test]
 fn a_model_that_is_too_large_misses_where_its_cost_says() {
-    let (structure, coefficients) = large();
+    let (structure, coefficients) = large(0.1);
     let model = Model::new(structure, &coefficients, None).unwrap();
     for (clock_mhz, seconds) in [(168.0, 5.0), (84.0, 5.0)] {
         let mut scenario = driving(&model, seconds, &[]);
@@ -194,6 +195,34 @@ fn models_of_other_robots_are_refused() {
     let model = firmware_core::parse(&ARM.0).unwrap();
     let error = run(&model, &Scenario::random(1.0), 1, &mut |_| Ok(())).unwrap_err();
     assert!(error.to_string().contains("the model of `two-link-arm` predicts [theta1"), "{error}");
+}
+
+#[test]
+fn a_model_with_another_sample_time_is_refused() {
+    let (structure, coefficients) = large(0.2);
+    let model = Model::new(structure, &coefficients, None).unwrap();
+    let error = run(&model, &driving(&model, 1.0, &[]), 1, &mut |_| Ok(())).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "the model's sample time is 0.2 s, the robot's loop has one of 0.1 s"
+    );
+}
+
+#[test]
+fn an_alarm_ends_soon_after_its_fault() {
+    for (model, fault) in models().iter().zip(["slip:1@10..20=0.5", "leak:0@10..20=0.5"]) {
+        let mut last_s = 0.0;
+        let summary = run(model, &driving(model, 60.0, &[fault]), 1, &mut |seen| {
+            if seen.frame.noticed.contains(Alarms::RESIDUAL) {
+                last_s = seen.frame.time_us as f64 * 1e-6;
+            }
+            Ok(())
+        });
+        let summary = summary.unwrap();
+        // The slow comparison is forgotten within ten of its samples, of one second or half of one.
+        assert!((15.0..35.0).contains(&last_s), "{last_s} s: {}", summary.text());
+        assert_eq!(summary.false_alarms(), 0, "{}", summary.text());
+    }
 }
 
 #[test]

@@ -787,22 +787,17 @@ fn every_command_in_every_mode() {
 #[test]
 fn every_alarm_in_every_mode() {
     let timing = Timing { period_us: 10, watchdog_us: 1000 };
-    let all = (0..13).map(|bit| {
-        let (alarm, _) =
-            Alarms::SAFE.iter().chain(others()).find(|(a, _)| a.bits() == 1 << bit).unwrap();
-        alarm
-    });
-    fn others() -> impl Iterator<Item = (Alarms, &'static str)> {
-        let flags = [
-            Alarms::RESIDUAL,
-            Alarms::OUTLIER,
-            Alarms::WHEEL,
-            Alarms::BAD_COMMAND,
-            Alarms::OUT_OF_RANGE,
-        ];
-        flags.into_iter().flat_map(|alarm| alarm.iter().collect::<Vec<_>>())
-    }
-    for alarm in all {
+    let flags = [
+        Alarms::RESIDUAL,
+        Alarms::OUTLIER,
+        Alarms::WHEEL,
+        Alarms::BAD_COMMAND,
+        Alarms::OUT_OF_RANGE,
+        Alarms::SENSOR_LATE,
+    ];
+    for (bit, (alarm, name)) in Alarms::all().enumerate() {
+        assert_eq!(alarm.bits(), 1 << bit, "{name}");
+        assert_ne!(alarm.intersects(Alarms::SAFE), flags.contains(&alarm), "{name}");
         let mut supervisor = Supervisor::new(timing);
         supervisor.raise(alarm);
         assert_eq!((supervisor.mode(), supervisor.alarms()), (Mode::Idle, alarm));
@@ -1107,6 +1102,38 @@ fn a_sensor_is_lost_where_the_prediction_cannot_be_trusted() {
 }
 
 #[test]
+fn a_sensor_too_slow_for_the_model_to_predict_is_lost() {
+    // The leg looks back at several samples, and never sees two in a row. They fill before the first that
+    // could be predicted; after that it may be blind for the eight samples of the bounds.
+    let allowed = LEG_BOUNDED.structure().lag() + 1 + 8;
+    let rig = Rig::new(true);
+    leg(&LEG_BOUNDED, &rig.clone(), SoftLegSettings::default(), |robot, frames| {
+        let mut now_us = 0;
+        for sample in 0..40 {
+            rig.measures(Some((sample % 2 == 0).then_some([0.0; 3])));
+            run(robot, &mut now_us, LEG_US, 1);
+            if sample == 0 {
+                robot.command(Command::Start);
+                assert_eq!(robot.mode(), Mode::Running, "there is a measurement");
+            }
+            assert!(frames.dequeue().unwrap().predicted.is_empty());
+            let expected = if sample < allowed { Mode::Running } else { Mode::Safe };
+            assert_eq!((robot.mode(), sample), (expected, sample));
+            robot.command(Command::Inputs([6.0; 2]));
+        }
+        assert!(robot.alarms().contains(Alarms::SENSOR_LOST) && rig.is_off());
+        robot.command(Command::Reset);
+        robot.command(Command::Start);
+        assert_eq!(robot.mode(), Mode::Idle, "refused");
+        rig.measures(Some(Some([0.0; 3])));
+        run(robot, &mut now_us, LEG_US, allowed);
+        robot.command(Command::Start);
+        run(robot, &mut now_us, LEG_US, 1);
+        assert_eq!(robot.mode(), Mode::Running);
+    });
+}
+
+#[test]
 fn a_sensor_is_bad_after_three_samples_that_are_no_numbers() {
     let bad = [
         Measurement::Taken([f32::NAN, 0.0]),
@@ -1236,6 +1263,23 @@ fn counts_wrap_both_ways_and_impossible_ones_are_not_believed() {
             assert!(robot.alarms().contains(Alarms::ENCODER) && rig.is_off());
         });
     }
+}
+
+#[test]
+fn a_stop_and_a_start_between_two_ticks_begin_anew() {
+    let rig = Rig::new(false);
+    rosbot(&ROSBOT, &rig, RosbotSettings::default(), |robot, frames| {
+        let mut now_us = 0;
+        drive(robot, frames, &rig, &mut now_us, [[0; 2]; 2]);
+        robot.command(Command::Start);
+        robot.command(Command::Inputs([10.0; 2]));
+        drive(robot, frames, &rig, &mut now_us, [[0; 2]; 20]);
+        assert_ne!(rig.0.borrow().duty, [0; 2]);
+        robot.command(Command::Stop);
+        robot.command(Command::Start);
+        drive(robot, frames, &rig, &mut now_us, [[0; 2]]);
+        assert_eq!((robot.mode(), rig.is_off()), (Mode::Running, true), "no integral part is left");
+    });
 }
 
 #[test]

@@ -236,13 +236,7 @@ fn compare(name: &str, model: &Model<'static>, frames: &[Frame]) -> [usize; HORI
     log += &names(robot.inputs.iter().map(|input| input.name.as_str()).collect());
     for (row, frame) in frames.iter().enumerate() {
         assert_eq!(frame.sequence as usize, row);
-        write!(
-            log,
-            "
-{}",
-            frame.time_us as f64 * 1e-6
-        )
-        .unwrap();
+        write!(log, "\n{}", frame.time_us as f64 * 1e-6).unwrap();
         // The trainer wants a number where nothing was measured; no window that begins there, or looks
         // back at it, is compared.
         let (measured, missing) = (&frame.measured, vec![0.0; robot.states.len()]);

@@ -24,6 +24,8 @@
 //! with p₀ = 4 × states × (1 − coverage), generous because errors come in bursts, and p₁ = 10 p₀, at most
 //! 0.1. Bounds that are exceeded as a matter of course (p₀ above 0.05) have only the first sum: calibrate
 //! with a coverage of 0.999 for a model that shall watch its robot.
+//!
+//! Neither sum grows far beyond its threshold, so that an alarm ends soon after its reason.
 
 use crate::capacity::MAX_STATES;
 use crate::error_bounds::ErrorBounds;
@@ -34,6 +36,8 @@ pub const CAP: f32 = 4.0;
 pub const FAR: f32 = 5.0;
 /// The second sum's threshold: five or six samples beyond the bounds out of some dozens.
 pub const OFTEN: f32 = 12.0;
+/// An alarm of the second sum ends after this many samples within the bounds, however long it has lasted.
+pub const CALM: f32 = 10.0;
 /// A single sample this many bounds off is not believed.
 pub const GATE: f32 = 8.0;
 
@@ -57,6 +61,10 @@ pub const GATE: f32 = 8.0;
 /// let errors = (1..100).map(|sample| if sample % 10 == 0 { 0.12 } else { 0.05 });
 /// let noticed = errors.map(|error| monitor.update(bounds, 1, &[error]).alarm).position(|a| a);
 /// assert_eq!(noticed, Some(59));
+/// // Beyond them for a minute, it is as the model says again: ten samples later nothing is noticed.
+/// (0..600).for_each(|_| _ = monitor.update(bounds, 1, &[0.12]));
+/// let calm = (1..1000).find(|_| !monitor.update(bounds, 1, &[0.05]).alarm);
+/// assert!(calm <= Some(11), "{calm:?}");
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Monitor {
@@ -105,7 +113,8 @@ impl Monitor {
             verdict.alarm |= *sum > FAR;
         }
         let told = if verdict.ratio > 1.0 { self.beyond } else { self.within };
-        self.often = (self.often + told).clamp(0.0, 2.0 * OFTEN);
+        // `within` is negative, or 0 with a sum that stays there.
+        self.often = (self.often + told).clamp(0.0, OFTEN - CALM * self.within);
         verdict.alarm |= self.often > OFTEN;
         verdict
     }

@@ -252,6 +252,10 @@ where
     /// What the host asks for.
     pub fn command(&mut self, command: Command<2>) {
         self.supervisor.follow(command, &mut self.wanted, &self.tracker);
+        if self.supervisor.mode() != Mode::Running {
+            // Also when a start follows before the next tick.
+            self.forget();
+        }
     }
 
     /// One tick: counts, controls the wheels' speeds, and at a sample measures, predicts and reports.

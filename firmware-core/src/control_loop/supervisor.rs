@@ -50,7 +50,8 @@ impl Alarms {
     pub const CLOCK: Self = Self(1 << 2);
     /// Several measurements in a row were NaN, infinite or could not be read.
     pub const SENSOR_BAD: Self = Self(1 << 3);
-    /// No measurement for longer than the prediction can be trusted.
+    /// No measurement for longer than the prediction can be trusted, or for as long too few in a row for
+    /// the model to predict at all.
     pub const SENSOR_LOST: Self = Self(1 << 4);
     /// An encoder could not be read, or counted faster than a wheel can turn, several times in a row.
     pub const ENCODER: Self = Self(1 << 5);
@@ -68,7 +69,6 @@ impl Alarms {
     pub const BAD_COMMAND: Self = Self(1 << 11);
     /// The model looked at values outside the range it was trained in.
     pub const OUT_OF_RANGE: Self = Self(1 << 12);
-
     /// A measurement was too old to belong to its sample, and was not used.
     pub const SENSOR_LATE: Self = Self(1 << 13);
 
@@ -198,12 +198,12 @@ impl Timing {
     /// Times of a loop with `ticks` ticks per sample of a model.
     ///
     /// # Errors
-    /// [`ControlLoopError::Setting`]: the period is shorter than 10 µs or longer than a day.
+    /// [`ControlLoopError::Setting`]: the period is shorter than 10 µs or longer than an hour.
     pub fn new(model: &Model<'_>, ticks: u32, watchdog_us: u32) -> Result<Self, ControlLoopError> {
         let sample_us = model.structure().sample_time_s() * 1e6;
         let period_us = (sample_us / ticks as f32 + 0.5) as u32;
-        // A timer cannot tick faster, and a day is no control loop.
-        if (10..=86_400_000).contains(&period_us) {
+        // A timer cannot tick faster, and an hour is no control loop.
+        if (10..=3_600_000_000).contains(&period_us) {
             Ok(Self { period_us, watchdog_us })
         } else {
             Err(ControlLoopError::Setting { field: "sample_time_s" })

@@ -86,7 +86,8 @@ impl<'q> Telemetry<'q> {
         Self { queue, sequence: 0, dropped: 0 }
     }
 
-    /// Numbers a frame, as [`Supervisor::report`](crate::control_loop::Supervisor::report) made it, and puts it into the queue; drops it when the queue is full.
+    /// Numbers a frame, as [`Supervisor::report`](crate::control_loop::Supervisor::report) made it, and
+    /// puts it into the queue; drops it when the queue is full.
     pub fn send(&mut self, frame: Frame) {
         let frame = Frame { sequence: self.sequence, dropped: self.dropped, ..frame };
         self.sequence = self.sequence.wrapping_add(1);

@@ -73,6 +73,9 @@ pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
     shadow_steps: u32,
     /// Samples without a measurement that was used.
     blind: u32,
+    /// Samples in a row for which nothing was predicted, and the most of them that are allowed.
+    unpredicted: u32,
+    unpredicted_limit: u32,
     /// Which of the last samples were predicted, a bit each, the newest the lowest, as many as the model
     /// looks at.
     guessed: u32,
@@ -103,6 +106,8 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         }
         let reach = model.error_bounds().and_then(|bounds| bounds.horizons().last().copied());
         let monitor = model.error_bounds().map_or_else(Monitor::default, Monitor::new);
+        let blind_limit = reach.map_or(blind_samples, |reach| reach.min(blind_samples));
+        let fills = u32::try_from(structure.lag()).unwrap_or(u32::MAX).saturating_add(1);
         Ok(Self {
             predictor: Predictor::new(model),
             state: PredictorState::new(),
@@ -111,10 +116,12 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             slow: monitor,
             shadow_steps: reach.map_or(SHADOW, |reach| reach.min(SHADOW)),
             blind: 0,
+            unpredicted: 0,
+            unpredicted_limit: blind_limit.saturating_add(fills),
             guessed: 0,
             // At least the present sample; lags are few.
             looks_at: u32::MAX >> (31 - structure.lag().min(31)),
-            blind_limit: reach.map_or(blind_samples, |reach| reach.min(blind_samples)),
+            blind_limit,
             bad: 0,
             outliers: 0,
             path: [[0.0; N]; H],
@@ -144,9 +151,11 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         }
     }
 
-    /// Whether the last sample had a measurement that was used.
+    /// Whether the last sample had a measurement that was used, and measurements come often enough for the
+    /// model to predict.
     pub fn sees(&self) -> bool {
-        self.blind == 0 && !self.state.history().is_empty()
+        let predicts = self.unpredicted <= self.unpredicted_limit;
+        self.blind == 0 && predicts && !self.state.history().is_empty()
     }
 
     /// Where the robot will be at each of the coming samples with the inputs held; shorter than `H`
@@ -174,6 +183,13 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         }
         if ahead.out_of_range().is_some() {
             alarms |= Alarms::OUT_OF_RANGE;
+        }
+        self.unpredicted = match predicted {
+            Some(_) => 0,
+            None => self.unpredicted.saturating_add(1),
+        };
+        if self.unpredicted > self.unpredicted_limit {
+            alarms |= Alarms::SENSOR_LOST;
         }
         let steps = predicted.map_or(0, |_| ahead.step());
         let guesses = (self.guessed & self.looks_at).count_ones();

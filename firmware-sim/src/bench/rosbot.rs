@@ -145,6 +145,11 @@ impl RosbotBench {
         })
     }
 
+    /// Whether the firmware drives nothing: motors without duty.
+    pub fn is_off(&self) -> bool {
+        self.pwm.iter().all(|duty| duty.get() == 0.0)
+    }
+
     /// Sets slip and sag to what the faults say now; call it once per tick.
     pub fn apply(&mut self, faults: &Faults) {
         self.slip = [0, 1].map(|side| faults.act(FaultKind::Slip, Some(side)).unwrap_or(0.0));

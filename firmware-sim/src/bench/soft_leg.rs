@@ -169,6 +169,11 @@ impl SoftLegBench {
         })
     }
 
+    /// Whether the firmware drives nothing: valves without duty, pumps off.
+    pub fn is_off(&self) -> bool {
+        self.valves.iter().all(|duty| duty.get() == 0.0) && !self.pumps.iter().any(Wire::get)
+    }
+
     /// Sets valves, leaks, pumps and sag to what the faults say now; call it once per tick.
     pub fn apply(&mut self, faults: &Faults) {
         for unit in 0..2 {
@@ -347,6 +352,18 @@ mod tests {
         bench.apply(&faults);
         assert_eq!((bench.stuck, bench.leaks), ([None; 2], [1.0; 2]));
         assert_eq!((bench.pump_strength, bench.sag), ([1.0; 2], 0.0));
+    }
+
+    #[test]
+    fn it_is_off_when_nothing_is_driven_whatever_the_supply() {
+        let (mut bench, mut devices) = bench();
+        bench.sag = 1.0;
+        assert!(bench.is_off());
+        devices.pumps[1].set_high().unwrap();
+        assert!(!bench.is_off());
+        devices.pumps[1].set_low().unwrap();
+        devices.valves[0].set_duty_cycle(1).unwrap();
+        assert!(!bench.is_off() && bench.volts() == [0.0; 2]);
     }
 
     #[test]

@@ -145,7 +145,7 @@ impl Rig<3> for RosbotBench {
         self.motion().pose
     }
     fn is_off(&self) -> bool {
-        self.volts() == [0.0; 2]
+        self.is_off()
     }
 }
 
@@ -200,6 +200,6 @@ impl Rig<2> for SoftLegBench {
         self.tip_mm()
     }
     fn is_off(&self) -> bool {
-        self.volts() == [0.0; 2]
+        self.is_off()
     }
 }

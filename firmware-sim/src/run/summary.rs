@@ -5,6 +5,7 @@ use crate::run::host::Counts;
 use crate::run::scenario::Scenario;
 use crate::run::{Robot, number};
 use firmware_core::control_loop::monitor::Monitor;
+use firmware_core::control_loop::tracker::SHADOW;
 use firmware_core::control_loop::{Alarms, Frame, Mode};
 use firmware_core::model::{Model, Space};
 use firmware_core::{Predictor, PredictorState, Scalar};
@@ -81,7 +82,8 @@ pub struct HorizonReport {
 pub struct AlarmReport {
     /// Its name.
     pub name: &'static str,
-    /// Times it came up.
+    /// Times it came up; one that is back within [`SHADOW`] samples, the time between two of the slow
+    /// comparisons, goes on.
     pub times: u64,
     /// Of them with no fault active, nor one that had just ended.
     pub false_alarms: u64,
@@ -120,6 +122,8 @@ pub struct Summary {
     pub states: Vec<(String, String)>,
     /// Windows over which the rollouts below were made.
     pub windows: u64,
+    /// Further windows, whose rollouts diverged.
+    pub diverged: u64,
     /// Errors by horizon.
     pub horizons: Vec<HorizonReport>,
     /// Share of samples, running and without a fault, within the one-step error bounds, per state.
@@ -160,14 +164,16 @@ pub(crate) struct Watch<const N: usize> {
     faults: Vec<Tracked>,
     rows: VecDeque<Row<N>>,
     next_sequence: Option<u32>,
-    /// The last frame's alarms.
-    noticed: Alarms,
+    /// Frames since each alarm was last noticed, up to one more than make it a new one.
+    quiet: [u32; 16],
     horizons: [usize; 3],
     squares: [[f64; N]; 3],
     /// Samples without a fault, and those within the bounds.
     samples: u64,
     within: [u64; N],
     times: [(u64, u64); 16],
+    /// Ticks in Idle, Running, Safe, and without supply.
+    ticks: [u64; 4],
 }
 
 impl<const N: usize> Watch<N> {
@@ -208,6 +214,7 @@ impl<const N: usize> Watch<N> {
             frames: [0; 4],
             states: structure.states().iter().map(named).collect(),
             windows: 0,
+            diverged: 0,
             horizons: Vec::new(),
             within: None,
             alarms: Vec::new(),
@@ -218,12 +225,13 @@ impl<const N: usize> Watch<N> {
             faults: scenario.faults.iter().map(|fault| tracked(fault.0)).collect(),
             rows: VecDeque::new(),
             next_sequence: None,
-            noticed: Alarms::none(),
+            quiet: [SHADOW + 1; 16],
             horizons: [1, ahead / 2, ahead],
             squares: [[0.0; N]; 3],
             samples: 0,
             within: [0; N],
             times: [(0, 0); 16],
+            ticks: [0; 4],
         }
     }
 
@@ -243,7 +251,7 @@ impl<const N: usize> Watch<N> {
             summary.deadline_misses += 1;
             summary.first_miss.get_or_insert(tick);
         }
-        summary.time_s[number(mode)] += summary.period_us as f64 * 1e-6;
+        self.ticks[number(mode)] += 1;
         summary.driven_at_rest += u64::from(mode != Mode::Running && !off);
         let t_s = began_us as f64 * 1e-6;
         for fault in self.faults.iter_mut().filter(|f| mode == Mode::Safe && f.covers(t_s)) {
@@ -254,7 +262,7 @@ impl<const N: usize> Watch<N> {
     /// The microcontroller has no supply.
     pub(crate) fn off(&mut self, now_us: u64, off: bool) {
         let summary = &mut self.summary;
-        summary.time_s[3] += summary.period_us as f64 * 1e-6;
+        self.ticks[3] += 1;
         summary.driven_at_rest += u64::from(!off);
         let t_s = now_us as f64 * 1e-6;
         let brown_outs = self.faults.iter_mut().filter(|f| f.fault.kind() == FaultKind::BrownOut);
@@ -271,13 +279,17 @@ impl<const N: usize> Watch<N> {
         let free = !self.faults.iter().any(|fault| fault.covers(t_s));
         let running = frame.mode == Mode::Running;
         for (i, (alarm, _)) in Alarms::all().enumerate() {
-            if frame.noticed.contains(alarm) && !self.noticed.contains(alarm) {
+            let quiet = &mut self.quiet[i];
+            *quiet = (*quiet + 1).min(SHADOW + 1);
+            if !frame.noticed.contains(alarm) {
+                continue;
+            }
+            if std::mem::take(quiet) > SHADOW {
                 let (times, wrong) = &mut self.times[i];
                 *times += 1;
-                *wrong += u64::from(free && running | frame.alarms.intersects(Alarms::SAFE));
+                *wrong += u64::from(free && (running || frame.alarms.intersects(Alarms::SAFE)));
             }
         }
-        self.noticed = frame.noticed;
 
         let structure = model.structure();
         let error: Option<[f32; N]> = (running && frame.predicted.len() == N).then(|| {
@@ -340,10 +352,12 @@ impl<const N: usize> Watch<N> {
             }
         }
         let mut predicted = [0.0_f32; N];
+        let (mut squares, mut diverged) = (self.squares, false);
         for (step, (measured, applied)) in (1..).zip(rows) {
             if predictor.step(&mut state, applied).is_err()
                 || predictor.coordinates(&state, &mut predicted).is_err()
             {
+                diverged = true;
                 break;
             }
             for (which, _) in self.horizons.iter().enumerate().filter(|(_, h)| **h == step) {
@@ -353,18 +367,25 @@ impl<const N: usize> Watch<N> {
                         Space::Line => difference,
                         Space::Circle => difference.wrap(),
                     };
-                    self.squares[which][i] += error * error;
+                    squares[which][i] += error * error;
                 }
             }
         }
-        self.summary.windows += 1;
+        if diverged {
+            self.summary.diverged += 1;
+        } else {
+            self.summary.windows += 1;
+            self.squares = squares;
+        }
         self.rows.drain(..horizon);
     }
 
     /// The run is over.
     pub(crate) fn finish(self, faults: &Faults, resets: u32, host: Counts) -> Summary {
         let mut summary = self.summary;
-        summary.seconds = summary.time_s.iter().sum();
+        let seconds = |ticks: u64| (ticks * summary.period_us) as f64 / 1e6;
+        summary.time_s = self.ticks.map(seconds);
+        summary.seconds = seconds(self.ticks.iter().sum());
         summary.resets = resets;
         summary.frames = [host.frames, host.lost, host.dropped, host.damaged];
         let windows = summary.windows as f64;
@@ -489,6 +510,9 @@ impl Summary {
         }
         line("false alarms", grouped(self.false_alarms()));
 
+        if self.diverged > 0 {
+            let _ = writeln!(text, "{:22} {} rollouts", "DIVERGED", grouped(self.diverged));
+        }
         if !self.horizons.is_empty() {
             let _ = writeln!(
                 text,
