@@ -91,7 +91,7 @@ struct ServeArgs {
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     seconds: Option<f64>,
     /// Times as fast as reality; 0 for as fast as it goes
-    #[arg(long, value_name = "X", default_value_t = 1.0)]
+    #[arg(long, value_name = "X", default_value_t = 1.0, allow_negative_numbers = true, value_parser = speed)]
     speed: f64,
 }
 
