@@ -252,6 +252,12 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
     let model = blob.model().map_err(|e| named(&e))?;
     let structure = model.structure();
     let scenario = scenario((args.scenario.as_deref(), args.seconds, &args.faults), structure)?;
+    // Not only after a run of a minute.
+    if let Some(path) = args.plot.as_ref().filter(|path| !folder_of(path).is_dir()) {
+        return Err(
+            format!("{}: cannot be written: there is no such folder", path.display()).into()
+        );
+    }
     let mut logger = args
         .log
         .as_ref()
@@ -307,9 +313,13 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
     }
 }
 
+fn folder_of(file: &Path) -> &Path {
+    file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Writes a file whole or not at all.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Box<dyn Error>> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     let failed = |e: &dyn std::fmt::Display| format!("{}: cannot be written: {e}", path.display());
     let mut file = tempfile::NamedTempFile::new_in(folder).map_err(|e| failed(&e))?;
     file.write_all(bytes).map_err(|e| failed(&e))?;

@@ -104,10 +104,17 @@ fn mistakes_get_one_line_and_leave_nothing_behind() {
         let said = refuse(folder, arguments);
         assert!(said.contains(fragment), "{arguments:?}: {said}");
     }
-    // A fault that is none is a mistake on the command line.
-    let output = firmware_sim(folder, &["run", ROSBOT, "--faults", "ice@1..2=1"]);
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert!(output.status.code() == Some(2) && said.contains("unknown fault `ice`"), "{said}");
+    // A fault or a speed that is none is a mistake on the command line.
+    for (arguments, fragment) in [
+        (&["--faults", "ice@1..2=1"][..], "unknown fault `ice`"),
+        (&["--live", "--speed", "-1"], "expected 0, or 0.001"),
+        (&["--live", "--speed", "nan"], "expected 0, or 0.001"),
+        (&["--live", "--speed", "1e-300"], "expected 0, or 0.001"),
+    ] {
+        let output = firmware_sim(folder, &[&["run", ROSBOT], arguments].concat());
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.code() == Some(2) && said.contains(fragment), "{said}");
+    }
     let mut left: Vec<_> =
         std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name()).collect();
     left.sort();

@@ -202,10 +202,14 @@ impl<'b> Figure<'b> {
             .margin(10)
             .x_label_area_size(if is_last { 40 } else { 14 })
             .y_label_area_size(70)
-            .build_cartesian_2d(t, -most..most)?;
+            .build_cartesian_2d(t.clone(), -most..most)?;
         for fault in &self.faults {
-            let ends = (fault.from_s(), fault.until_s().min(1e12));
-            let corners = [(ends.0, -most), (ends.1, most)];
+            // What lies far outside has no pixels that fit into an integer.
+            let (from_s, until_s) = (fault.from_s().max(t.start), fault.until_s().min(t.end));
+            if from_s >= until_s {
+                continue;
+            }
+            let corners = [(from_s, -most), (until_s, most)];
             chart.draw_series([Rectangle::new(corners, FAULT.filled())])?;
         }
         let label = if is_last { "time [s]" } else { "" };
