@@ -639,10 +639,13 @@ fn with_broken(
     for tick in 0..80_u16 {
         let before = robot.mode();
         let calls = rig.0.borrow().failed;
+        // Wheels turn the way that they are driven: high is backwards.
+        let mut hardware = rig.0.borrow_mut();
         for wheel in 0..2 {
-            let count = rig.0.borrow().counts[wheel];
-            rig.0.borrow_mut().counts[wheel] = count.wrapping_add(20);
+            let turned = if hardware.pins[wheel] { -20 } else { 20 };
+            hardware.counts[wheel] = hardware.counts[wheel].wrapping_add_signed(turned);
         }
+        drop(hardware);
         let after = robot.tick(now_us);
         assert!(
             after == Mode::Running || rig.is_off(),
@@ -1227,9 +1230,9 @@ fn inputs_of_a_sample_are_the_mean_of_its_ticks() {
 
 #[test]
 fn counts_wrap_both_ways_and_impossible_ones_are_not_believed() {
-    // Both ways across zero at 50 counts, 19.25 rad/s: the robot runs on, and with the wheels as fast
-    // as commanded the motors see the integral part only.
-    for (start, turned) in [(65_500_u16, 50_i16), (20, -50), (0, 0)] {
+    // Both ways across zero at 43 counts, 16.6 rad/s: the robot runs on, and with the wheels about as fast
+    // as commanded the motors see little but the integral part.
+    for (start, turned) in [(65_500_u16, 43_i16), (20, -43), (0, 0)] {
         let rig = Rig::new(false);
         rig.0.borrow_mut().counts = [start; 2];
         rosbot(&ROSBOT, &rig, RosbotSettings::default(), |robot, frames| {
@@ -1283,33 +1286,39 @@ fn a_stop_and_a_start_between_two_ticks_begin_anew() {
 }
 
 #[test]
-fn a_blocked_wheel_is_noticed_within_a_second_and_a_turning_one_is_not() {
-    for (turned, blocked) in
-        [([26, 26], false), ([0, 26], true), ([26, 0], true), ([26, -26], true)]
-    {
+fn a_slow_wheel_is_noticed_within_a_second_and_one_that_is_not_counted_stops_the_robot() {
+    // 26 counts a tick are 10.01 rad/s.
+    for (turned, noticed, stopped) in [
+        ([26, 26], false, false),
+        ([13, 26], true, false),
+        ([26, 13], true, false),
+        // Blocked, or a dead encoder; an encoder with swapped wires.
+        ([0, 26], false, true),
+        ([26, 0], false, true),
+        ([26, -26], false, true),
+    ] {
         let rig = Rig::new(false);
         rosbot(&ROSBOT, &rig, RosbotSettings::default(), |robot, frames| {
             let mut now_us = 0;
             drive(robot, frames, &rig, &mut now_us, [[0; 2]; 2]);
             robot.command(Command::Start);
-            let mut noticed = None;
-            for tick in 0..100 {
-                // 26 counts a tick are 10.01 rad/s.
+            let (mut told, mut ticks) = (false, 0);
+            for _ in 0..100 {
                 robot.command(Command::Inputs([10.0, 10.0]));
                 let frames = drive(robot, frames, &rig, &mut now_us, [turned]);
-                if frames.iter().any(|frame| frame.noticed.contains(Alarms::WHEEL)) {
-                    noticed.get_or_insert(tick);
-                }
+                told |= frames.iter().any(|frame| frame.noticed.contains(Alarms::WHEEL));
+                ticks += i32::from(robot.mode() == Mode::Running);
             }
-            assert_eq!(noticed.is_some(), blocked, "{turned:?}");
-            assert_eq!(robot.mode(), Mode::Running, "the host decides");
-            if blocked {
+            assert_eq!(robot.mode() == Mode::Safe, stopped, "{turned:?}");
+            assert_eq!(robot.alarms().contains(Alarms::ENCODER), stopped, "{turned:?}");
+            if stopped {
+                assert!((28..35).contains(&ticks) && rig.is_off(), "{turned:?}: {ticks} ticks");
+            } else {
+                assert_eq!(told, noticed, "{turned:?}: a slow wheel is for the host to judge");
                 robot.command(Command::Stop);
                 let frames = drive(robot, frames, &rig, &mut now_us, [[0; 2]; 20]);
-                assert!(
-                    !frames.last().unwrap().noticed.contains(Alarms::WHEEL),
-                    "forgotten at rest"
-                );
+                let last = frames.last().unwrap();
+                assert!(!last.noticed.contains(Alarms::WHEEL), "forgotten at rest");
             }
         });
     }

@@ -114,6 +114,9 @@ pub struct RosbotSettings {
     /// A wheel that is this much slower or faster than commanded, on average over about a second, is an
     /// alarm (rad/s).
     pub wheel_tolerance_radps: f32,
+    /// Voltage with which every wheel turns, whatever it has to push (V): a motor that has it for 0.3 s
+    /// without a wheel that is counted to turn stops the robot.
+    pub stall_volt: f32,
     /// A running robot stops after this time without a command (µs).
     pub watchdog_us: u32,
     /// Samples in a row without a measured pose after which it stops, or fewer where the model's error
@@ -133,6 +136,7 @@ impl Default for RosbotSettings {
             integral_gain: 9.0,
             fastest_radps: 60.0,
             wheel_tolerance_radps: 2.5,
+            stall_volt: 4.0,
             watchdog_us: 1_000_000,
             blind_samples: 10,
         }
@@ -141,6 +145,12 @@ impl Default for RosbotSettings {
 
 /// Ticks in a row that an encoder may be unreadable or implausible.
 const BAD_COUNTS: u8 = 5;
+/// A motor that has had the stall voltage for so long (s) while its wheel was not counted to turn its way by
+/// as much as the stall speed (rad/s), and was off by more than twice that, has a dead or swapped encoder,
+/// or is blocked: the integral of its controller would drive it to full voltage. One that brakes downhill
+/// is as fast as commanded.
+const STALL_S: f32 = 0.3;
+const STALL_RADPS: f32 = 0.5;
 /// Share of the newest sample in the mean deviation of a wheel's speed: about ten samples.
 const WHEEL_SHARE: f32 = 0.1;
 
@@ -157,6 +167,8 @@ struct Side {
     deviation: f32,
     /// Its mean over samples.
     mean_deviation: f32,
+    /// How long the motor has had the stall voltage in vain (s).
+    stalled_s: f32,
 }
 
 impl Side {
@@ -170,6 +182,9 @@ impl Side {
         if !winds_up {
             self.integral += integral_gain * error * period_s;
         }
+        let in_vain =
+            volt.abs() >= settings.stall_volt && self.speed * 1.0_f32.copysign(volt) < STALL_RADPS;
+        self.stalled_s = if in_vain { self.stalled_s + period_s } else { 0.0 };
         volt
     }
 }
@@ -224,6 +239,7 @@ where
             ("integral_gain", settings.integral_gain),
             ("fastest_radps", settings.fastest_radps),
             ("wheel_tolerance_radps", settings.wheel_tolerance_radps),
+            ("stall_volt", settings.stall_volt),
         ] {
             // Gains of a million and more are typing errors that would overflow.
             if !(value > 0.0 && value < 1e6) {
@@ -272,6 +288,9 @@ where
             {
                 let volt = side.control(command, &self.settings, self.period_s);
                 *share = volt / self.settings.supply_volt;
+            }
+            if self.sides.iter().any(|side| side.stalled_s > STALL_S) {
+                self.supervisor.raise(Alarms::ENCODER);
             }
         } else {
             self.forget();
@@ -376,6 +395,7 @@ where
             side.integral = 0.0;
             side.deviation = 0.0;
             side.mean_deviation = 0.0;
+            side.stalled_s = 0.0;
         }
     }
 }

@@ -53,7 +53,8 @@ impl Alarms {
     /// No measurement for longer than the prediction can be trusted, or for as long too few in a row for
     /// the model to predict at all.
     pub const SENSOR_LOST: Self = Self(1 << 4);
-    /// An encoder could not be read, or counted faster than a wheel can turn, several times in a row.
+    /// An encoder could not be read, or counted faster than a wheel can turn, several times in a row; or a
+    /// motor under voltage whose wheel is not counted to turn.
     pub const ENCODER: Self = Self(1 << 5);
     /// The prediction diverged.
     pub const DIVERGED: Self = Self(1 << 6);
@@ -346,6 +347,8 @@ impl Supervisor {
         }
         if self.mode != Mode::Running && actuators.stop().is_err() {
             self.raise(Alarms::ACTUATOR);
+            // It may have been this once.
+            let _ = actuators.stop();
         }
         self.mode
     }

@@ -3,7 +3,9 @@
 //!
 //! What is measured is compared twice: with the prediction from the last measurement, where sudden things
 //! show (a spike, wheels that slip), and every [`SHADOW`] samples with a second prediction that has not
-//! been corrected since, where slow ones do (a leak, a valve that is stuck, a sensor that stands still).
+//! been corrected since, where slow ones do (a leak, a valve that is stuck, a sensor that stands still). The
+//! second one begins where all samples that the model looks at are measured: with gaps closer together
+//! than that, only the first one watches.
 
 use crate::control_loop::ControlLoopError;
 use crate::control_loop::monitor::{GATE, Monitor, Verdict};

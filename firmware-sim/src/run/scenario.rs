@@ -230,7 +230,9 @@ impl Scenario {
         };
         let is_positive = |x: f64| x > 0.0 && x.is_finite();
         let is_share = |x: f64| (0.0..=1.0).contains(&x);
-        check("seconds", positive, self.seconds, is_positive(self.seconds))?;
+        let century = "be above 0 and at most 1e10";
+        let lasts = is_positive(self.seconds) && self.seconds <= 1e10;
+        check("seconds", century, self.seconds, lasts)?;
         for leg in &self.drive {
             check("for_s", positive, leg.for_s, is_positive(leg.for_s))?;
             for u in &leg.inputs {
