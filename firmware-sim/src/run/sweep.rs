@@ -112,8 +112,9 @@ pub fn cases(robot: Robot) -> Vec<Case> {
         Robot::Rosbot => cases.extend([
             (MissedCounts, Some(0), 0.1, Noticed(weak)),
             (MissedCounts, Some(0), 0.5, Noticed(strong)),
-            // An encoder that is dead: the controller would drive at full voltage.
-            (MissedCounts, Some(0), 1.0, MustStop(5.0)),
+            // A dead encoder, as soon as the wheel is commanded to turn: its controller would drive it at
+            // full voltage.
+            (MissedCounts, Some(0), 1.0, MustStop(10.0)),
             // 16 bits wrap every eight seconds anyway.
             (Wrap, None, 0.999, Survived),
             (Slip, None, 0.1, Noticed(weak)),
