@@ -53,8 +53,9 @@
 //! |---|---|---|
 //! | erase | a header, marks or payload that are none any more, or all of the old ones | runs the other slot, which was not touched; `begin` erases again, whatever the sectors read as |
 //! | payload | no header | the same |
-//! | header | a header whose CRC is wrong, or one without a commit mark | the same |
-//! | commit mark | a cell that is not exactly the word | rejects the slot, runs the other one; if the word is there, the update is committed |
+//! | header | a header whose CRC is wrong | the same |
+//! | before the commit mark | a header without it | sets the reject mark, runs the other slot |
+//! | commit mark | a cell that is not exactly the word | sets the reject mark, runs the other slot; if the word is there, the update is committed |
 //! | trial mark | a torn cell | sets the second one and runs the trial; if both are torn, the trial counts as over |
 //! | anywhere on trial | a trial mark without confirmation | sets the reject mark, runs the other slot |
 //! | confirm mark | a torn cell | the same: not confirmed; if the word is there, it is confirmed, and the floor has risen with that same word |
@@ -547,11 +548,6 @@ impl Cells {
     fn is_set(self) -> bool {
         self.set > 0
     }
-
-    /// Whether somebody began to set it, if it is not set.
-    fn is_torn(self) -> bool {
-        !self.is_set() && self.erased < 2
-    }
 }
 
 /// What is written before the payload.
@@ -569,8 +565,8 @@ struct Record {
 /// What a slot is good for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
-    /// An update that was never committed. `true` if that has to be decided for good.
-    NotCommitted(bool),
+    /// An update that was never committed.
+    NotCommitted,
     /// Committed and never run.
     Fresh,
     /// On trial at an earlier boot, or aborted.
@@ -580,10 +576,10 @@ enum State {
 
 impl Record {
     fn state(&self) -> State {
-        if self.rejected.is_set() || self.rejected.is_torn() {
+        if self.rejected.erased < 2 {
             State::Rejected
         } else if !self.committed.is_set() {
-            State::NotCommitted(self.committed.is_torn())
+            State::NotCommitted
         } else if self.confirmed.is_set() {
             State::Confirmed
         } else if self.trial.is_set() || self.trial.erased == 0 {
@@ -711,25 +707,19 @@ impl<F: NorFlash> Slots<F> {
 
     /// Reads what is before the payload, and decides for good what a cut may have left undecided.
     fn settled(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
-        let mut record = self.record(side)?;
+        let record = self.record(side)?;
         let state = record.state();
-        let reject = match state {
-            State::Rejected | State::NotCommitted(true) => true,
-            State::NotCommitted(false) | State::Fresh | State::Confirmed => false,
-        };
-        // A failure here leaves what was found, which is decided the same way at the next boot.
+        let is_live = matches!(state, State::Fresh | State::Confirmed);
+        // A failure here leaves what was found, which the next boot finds again.
         let marks = [
-            (Mark::Committed, record.committed, record.committed.is_set()),
+            (Mark::Committed, record.committed, is_live),
             (Mark::Confirmed, record.confirmed, state == State::Confirmed),
-            (Mark::Rejected, record.rejected, reject),
+            (Mark::Rejected, record.rejected, !is_live),
         ];
         for (mark, cells, wanted) in marks {
             if wanted && cells.erased > 0 {
                 let _ = self.set(side, mark, record.check);
             }
-        }
-        if reject && state != State::Rejected {
-            record.rejected = Cells { set: 1, erased: 0 };
         }
         Ok(record)
     }
@@ -743,7 +733,7 @@ impl<F: NorFlash> Slots<F> {
     ) -> Result<Payload, Refusal<F::Error>> {
         let Header { length, sequence, robot, sha256, .. } = record.header;
         let trial = match record.state() {
-            State::NotCommitted(_) => return Err(Refusal::NotCommitted),
+            State::NotCommitted => return Err(Refusal::NotCommitted),
             State::Rejected => return Err(Refusal::Rejected),
             State::Fresh => true,
             State::Confirmed => false,
