@@ -109,6 +109,8 @@ enum Mutation {
     NoTrialMark,
     /// The confirm mark is not kept.
     NoConfirmMark,
+    /// The commit mark is not kept, but reads as set beside any header.
+    NoCommitMark,
 }
 
 impl Mutation {
@@ -174,6 +176,10 @@ impl<const WRITE: usize, const ERASE: usize> ReadNorFlash for Seen<'_, WRITE, ER
                 bytes[(at - offset) as usize..][..kept.len()].copy_from_slice(kept);
             }
         }
+        if mutation == Mutation::NoCommitMark && within == 0 && bytes.len() > 96 {
+            let word = mark(b"CMIT", &bytes[..64]);
+            bytes[64..72].copy_from_slice(&word);
+        }
         if mutation.blind_hash() && within >= PAYLOAD_OFFSET {
             let mut hash = [0; 32];
             self.region.read(slot + 24, &mut hash)?;
@@ -218,7 +224,8 @@ impl<const WRITE: usize, const ERASE: usize> NorFlash for Seen<'_, WRITE, ERASE>
         let header_first = self.mutation.is_some_and(Mutation::header_first);
         match (within, self.mutation) {
             (0 | 64, _) if header_first => Ok(()),
-            (128 | 160, Some(Mutation::NoTrialMark))
+            (64 | 96, Some(Mutation::NoCommitMark))
+            | (128 | 160, Some(Mutation::NoTrialMark))
             | (192 | 224, Some(Mutation::NoConfirmMark)) => {
                 self.unkept.push((offset, bytes.to_vec()));
                 Ok(())
@@ -266,16 +273,20 @@ enum Start {
     Twins,
     /// The old model in A, the new one in B, which was on trial and not confirmed.
     Rejected,
+    /// The old model in A, damaged since: the factory model runs, but the floor stays.
+    Decayed,
 }
 
-const STARTS: [Start; 5] =
-    [Start::Erased, Start::Old, Start::Retired, Start::Twins, Start::Rejected];
+const STARTS: [Start; 6] =
+    [Start::Erased, Start::Old, Start::Retired, Start::Twins, Start::Rejected, Start::Decayed];
 
 /// What the next boot may give, as far as it has been promised.
 #[derive(Clone, Copy, Debug)]
 struct May {
     be_old: bool,
     be_new: bool,
+    /// Updates that will not be committed.
+    drop_updates: u32,
     /// Trials that will not be confirmed.
     drop_trials: u32,
 }
@@ -321,7 +332,7 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
         let Models { older, old, new, .. } = models;
         match start {
             Start::Erased => {}
-            Start::Old => lab.install(old, OLD, true),
+            Start::Old | Start::Decayed => lab.install(old, OLD, true),
             Start::Retired => {
                 lab.install(older, OLDER, true);
                 lab.install(old, OLD, true);
@@ -336,6 +347,10 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
             }
         }
         lab.image = lab.flash.snapshot();
+        if start == Start::Decayed {
+            lab.image[(offset + PAYLOAD_OFFSET) as usize] ^= 1;
+            lab.flash.restore(&lab.image, 1);
+        }
         lab
     }
 
@@ -373,7 +388,7 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
 
     fn install(&self, model: &[u8], sequence: u32, confirm: bool) {
         let (mut slots, _) = self.boot();
-        self.update(&mut slots, model, sequence, &mut || {}).unwrap();
+        self.update(&mut slots, model, sequence);
         let (mut slots, boot) = self.boot();
         assert!(boot.trial);
         if confirm {
@@ -383,13 +398,12 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
         assert_eq!(boot.floor == sequence, confirm);
     }
 
-    /// All of an update but the trial.
-    fn update(
+    /// All of an update but the commit.
+    fn send(
         &self,
         slots: &mut Slots<Seen<'_, WRITE, ERASE>>,
         model: &[u8],
         sequence: u32,
-        before_commit: &mut dyn FnMut(),
     ) -> Result<(), String> {
         let release = Release::new(&self.models.robot, sequence, model).unwrap();
         slots.begin(&release).map_err(|error| format!("begin: {error:?}"))?;
@@ -397,14 +411,18 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
             let written = slots.write((i * PART) as u32, part);
             written.map_err(|error| format!("write: {error:?}"))?;
         }
-        slots.verify().map_err(|error| format!("verify: {error:?}"))?;
-        before_commit();
-        slots.commit().map_err(|error| format!("commit: {error:?}"))
+        slots.verify().map_err(|error| format!("verify: {error:?}"))
     }
 
-    /// What may be at the start.
-    fn at_start(&self, drop_trials: u32) -> May {
-        May { be_old: true, be_new: false, drop_trials }
+    /// All of an update but the trial.
+    fn update(&self, slots: &mut Slots<Seen<'_, WRITE, ERASE>>, model: &[u8], sequence: u32) {
+        self.send(slots, model, sequence).unwrap();
+        slots.commit().unwrap();
+    }
+
+    /// What may be at the start, and how often update and trial are dropped.
+    fn at_start(&self, detours: u32) -> May {
+        May { be_old: true, be_new: false, drop_updates: detours, drop_trials: detours }
     }
 
     /// From power-on until the new model is confirmed, or the power fails. An error is a promise that
@@ -414,7 +432,7 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
         let mut boots = 0;
         loop {
             boots += 1;
-            if boots > 6 {
+            if boots > 8 {
                 return Err("the update does not come to an end".to_owned());
             }
             let (mut slots, boot) = self.boot();
@@ -443,10 +461,17 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
                 }
                 (false, _) => {
                     *may = May { be_old: true, be_new: false, ..*may };
-                    let mut before_commit = || may.be_new = true;
-                    let model = &self.models.new;
-                    match self.update(&mut slots, model, NEW, &mut before_commit) {
-                        // Committed: the next boot has to try it.
+                    let sent = self.send(&mut slots, &self.models.new, NEW);
+                    if sent.is_ok() && may.drop_updates > 0 {
+                        may.drop_updates -= 1;
+                        continue;
+                    }
+                    let committed = sent.and_then(|()| {
+                        may.be_new = true;
+                        slots.commit().map_err(|error| format!("commit: {error:?}"))
+                    });
+                    match committed {
+                        // The next boot has to try it.
                         Ok(()) => may.be_old = false,
                         Err(_) if lost() => {}
                         Err(error) => return Err(error),
@@ -476,7 +501,7 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
         let bytes = boot.payload.map(|payload| self.payload(payload).unwrap());
         let is_new = bytes.as_ref() == Some(&self.models.new);
         let is_old = match self.start {
-            Start::Erased => boot.running == Which::Factory && bytes.is_none(),
+            Start::Erased | Start::Decayed => boot.running == Which::Factory && bytes.is_none(),
             _ => bytes.as_ref() == Some(&self.models.old),
         };
         if !is_new && !is_old {
@@ -487,6 +512,22 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
         }
         if is_old && !may.be_old {
             return fail("the old model, which must not run");
+        }
+        if is_new {
+            // Not by chance: what has been promised is there in so many words.
+            let begin = boot.payload.unwrap().offset - PAYLOAD_OFFSET;
+            let mut record = [0; PAYLOAD_OFFSET as usize];
+            self.region().read(begin, &mut record).unwrap();
+            let is_set = |name, cell: usize| {
+                let word = mark(name, &record[..64]);
+                [cell, cell + 32].into_iter().any(|cell| record[cell..cell + 8] == word)
+            };
+            if !is_set(b"CMIT", 64) {
+                return fail("the new model, which was not committed");
+            }
+            if !boot.trial && !is_set(b"CNFM", 192) {
+                return fail("the new model, which was not confirmed");
+            }
         }
         if is_old && boot.trial {
             return fail("the old model on trial");
@@ -528,8 +569,8 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
     }
 
     /// A cut at each of the steps; their number.
-    fn single_cuts(&self, drop_trials: u32, stride: usize) -> Result<u64, String> {
-        let may = self.at_start(drop_trials);
+    fn single_cuts(&self, detours: u32, stride: usize) -> Result<u64, String> {
+        let may = self.at_start(detours);
         let steps = self.steps(&self.image, may)?;
         let mut count = 0;
         for cut in (0..steps).step_by(stride) {
@@ -666,10 +707,10 @@ fn all_single_cuts(stride: usize) -> u64 {
     let mut count = 0;
     for models in Models::all() {
         for start in STARTS {
-            for drop_trials in [0, 1] {
-                count += words(&models, start).single_cuts(drop_trials, stride).unwrap();
-                count += bytes(&models, start).single_cuts(drop_trials, stride).unwrap();
-                count += small(&models, start).single_cuts(drop_trials, stride).unwrap();
+            for detours in [0, 1] {
+                count += words(&models, start).single_cuts(detours, stride).unwrap();
+                count += bytes(&models, start).single_cuts(detours, stride).unwrap();
+                count += small(&models, start).single_cuts(detours, stride).unwrap();
             }
         }
         println!("{}: {count} cuts so far", models.robot);
@@ -781,15 +822,18 @@ fn many_cuts_in_a_row_leave_the_old_or_the_new_model() {
 fn a_slot_that_is_made_wrong_is_noticed() {
     let models = &Models::all()[0];
     let with = |mutation| small(models, Start::Retired).mutated(mutation);
-    // What is noticed first when single cuts are made at every step, with a dropped trial or without.
-    let noticed = |mutation, drop_trials| with(mutation).single_cuts(drop_trials, 1).unwrap_err();
+    // What is noticed first when single cuts are made at every step, with detours or without.
+    let noticed = |mutation, detours| with(mutation).single_cuts(detours, 1).unwrap_err();
 
     // The payload is whole but nobody said so.
-    let error = noticed(Mutation::HeaderFirst, 0);
+    let error = noticed(Mutation::HeaderFirst, 1);
     assert!(error.contains("the new model, which must not run"), "{error}");
     // Not even that.
     let error = noticed(Mutation::HeaderFirstBlindHash, 0);
     assert!(error.contains("neither the old nor the new model"), "{error}");
+    // Header and payload are right, but the commit mark is left out.
+    let error = noticed(Mutation::NoCommitMark, 0);
+    assert!(error.contains("the new model, which was not committed"), "{error}");
     let error = noticed(Mutation::NoTrialMark, 1);
     assert!(error.contains("the new model, which must not run"), "{error}");
     let error = noticed(Mutation::NoConfirmMark, 0);
@@ -830,14 +874,11 @@ fn what_a_boot_has_decided_stays_decided() {
                 for (name, cell) in [(b"CMIT", 64), (b"TRIL", 128), (b"CNFM", 192)] {
                     lab.flash.restore(&lab.image, seed);
                     let (mut slots, _) = lab.boot();
-                    let cut = || lab.flash.cut_power_after(64 + torn);
-                    let mut before_commit = || {
-                        if cell == 64 {
-                            cut()
-                        }
-                    };
-                    let updated = lab.update(&mut slots, &models.new, NEW, &mut before_commit);
-                    assert_eq!(updated.is_ok(), cell != 64);
+                    lab.send(&mut slots, &models.new, NEW).unwrap();
+                    if cell == 64 {
+                        lab.flash.cut_power_after(64 + torn);
+                    }
+                    assert_eq!(slots.commit().is_ok(), cell != 64);
                     if cell == 128 {
                         lab.flash.cut_power_after(torn);
                         lab.boot();
@@ -900,7 +941,7 @@ fn the_bytes_are_as_specified() {
     let models = &Models::all()[0];
     let lab = small(&Models { robot: "rosbot".to_owned(), ..models.clone() }, Start::Erased);
     let (mut slots, _) = lab.boot();
-    lab.update(&mut slots, b"koopman", 7, &mut || {}).unwrap();
+    lab.update(&mut slots, b"koopman", 7);
     let at = 1024;
     let slot = |len: usize| lab.flash.snapshot()[at..at + len].to_vec();
     let header = "534c4f5401004001070000000700000001000000843f9e6b1a45a8259ac87e6d8ad109746bde42bf79e3c47ae27a3d724e8bf1aa54647aea000000003f68df23";
@@ -942,7 +983,7 @@ fn an_unconfirmed_trial_is_reverted_and_not_repeated() {
     let lab = words(models, Start::Old);
     let (mut slots, _) = lab.boot();
     assert_eq!(slots.confirm(), Err(MarkError::NotReady));
-    lab.update(&mut slots, &models.new, NEW, &mut || {}).unwrap();
+    lab.update(&mut slots, &models.new, NEW);
     assert_eq!(slots.running(), Which::A);
 
     let (mut slots, boot) = lab.boot();
@@ -989,7 +1030,7 @@ fn what_is_below_the_floor_neither_comes_nor_stays() {
         slots.begin(&release(OLD)).unwrap();
         assert_eq!(lab.flash.snapshot()[0x4000..], image[0x4000..]);
     }
-    lab.update(&mut slots, &models.new, OLD, &mut || {}).unwrap();
+    lab.update(&mut slots, &models.new, OLD);
     let (mut slots, boot) = lab.boot();
     assert_eq!((boot.running, boot.trial), (Which::A, true));
     slots.confirm().unwrap();
@@ -1040,7 +1081,7 @@ fn an_update_that_is_aborted_or_damaged_does_not_run() {
     assert_eq!(slots.write(10, &models.new[10..]), Err(WriteError::NotWriting));
     assert_eq!(slots.verify(), Err(VerifyError::NotWriting));
     assert_eq!(lab.boot().1.running, Which::A);
-    lab.update(&mut slots, &models.new, NEW, &mut || {}).unwrap();
+    lab.update(&mut slots, &models.new, NEW);
     slots.abort().unwrap();
     let (mut slots, boot) = lab.boot();
     assert_eq!((boot.running, boot.refused), (Which::A, [None, Some(Refusal::Rejected)]));
