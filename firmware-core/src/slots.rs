@@ -8,7 +8,8 @@
 //! Erasing stalls most controllers for as long as seconds, programming for microseconds. When that is
 //! allowed is the caller's business: call [`begin`](Slots::begin), [`write`](Slots::write),
 //! [`verify`](Slots::verify), [`commit`](Slots::commit) and [`abort`](Slots::abort) only while the
-//! actuators are switched off, the loop being in Safe. [`confirm`](Slots::confirm) programs 16 bytes.
+//! actuators are switched off, the loop being in Safe. [`confirm`](Slots::confirm) programs two words of 8
+//! bytes while the loop runs.
 //!
 //! # Layout
 //!
@@ -64,24 +65,24 @@
 //! Why it holds:
 //!
 //! - The running slot is only ever marked, never erased. On trial no update may begin, because the other
-//!   slot is what a revert goes back to. From the factory model, the slot that holds the floor is kept.
+//!   slot is what a revert goes back to.
 //! - Each transition is one word that is only programmed where all bits of its write unit are erased, so
 //!   that it can be done again, in the second cell, after a cut. With the header's CRC in it, marks of
 //!   an earlier update or of a half-erased sector do not fit another header.
 //! - A cell that was cut short may read as this now and as that later. So a boot that acts on a mark
 //!   first sets the cell that is still erased, and one that acts on a missing confirmation or commit sets the
-//!   reject mark, which beats all others: what has been decided stays decided. A confirmation that
-//!   is done when power fails is in two cells or will be.
+//!   reject mark, which beats all others: what has been decided stays decided.
 //! - The trial mark is set before the model is handed to the caller: a model that crashes the
 //!   controller while it is parsed runs once.
-//! - No word but the payload's hash says that the payload is whole. It is compared at each boot.
+//! - The payload's hash is compared before the header is written, and again at each boot: against cuts the
+//!   commit mark alone is enough, against damage that comes later it is not.
 //!
 //! # Floor
 //!
 //! The floor is the largest sequence number of a confirmed slot, or the one that the image asks for, if
 //! that is larger. Neither a new nor an old model below it ever runs. It rises with the confirm
-//! mark, needs no storage of its own, and cannot fall: a slot that holds it is only erased when the other
-//! one holds as large a number, or when it is running (never).
+//! mark, needs no storage of its own, and does not fall: while a confirmed model runs, it is the one with the
+//! floor, and is not erased; while the factory model runs, the slot with the larger number is kept.
 //!
 //! # What it does not do
 //!

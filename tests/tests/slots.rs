@@ -1,7 +1,9 @@
 //! Model slots under power cuts: at every flash operation of an update, and at every one of the recovery
 //! after it, boot gives the old or the new model, whole, and the update can be done again.
 //!
-//! A step is a byte programmed or a sector erased. A cut tears the byte or the sector under way.
+//! A step is a byte programmed or a sector erased. A cut tears the write unit or the sector under way.
+//! What counts as kept is in [`Lab::live`]; that it notices what is not, in
+//! [`a_slot_that_is_made_wrong_is_noticed`].
 
 use std::cell::Cell;
 use std::path::Path;
@@ -24,8 +26,6 @@ const OLD: u32 = 3;
 const NEW: u32 = 4;
 /// Bytes of a part of the payload: no multiple of any write unit.
 const PART: usize = 97;
-
-// Models ------------------------------------------------------------------------------------------
 
 /// Bytes at an address that the core accepts.
 struct Room(Box<Aligned<[u8; 4096]>>);
@@ -93,8 +93,6 @@ fn variant(robot: &str, blob: &[u8], bit: u8) -> Vec<u8> {
     Room::new().parse(robot, &bytes).unwrap();
     bytes
 }
-
-// Flash -------------------------------------------------------------------------------------------
 
 /// What is wrong on purpose, to see that the tests notice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -257,8 +255,6 @@ fn crc32(bytes: &[u8]) -> u32 {
     let step = |crc: u32, _| (crc >> 1) ^ if crc & 1 == 1 { 0xEDB8_8320 } else { 0 };
     !bytes.iter().fold(u32::MAX, |crc, byte| (0..8).fold(crc ^ u32::from(*byte), step))
 }
-
-// The life of a robot -----------------------------------------------------------------------------
 
 /// What is in the slots before the update.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -698,8 +694,6 @@ fn small(models: &Models, start: Start) -> Small {
     Lab::new(models, start, 4, 1)
 }
 
-// Cuts --------------------------------------------------------------------------------------------
-
 /// Steps between cut points of the short tests: a prime, so that all bytes of words are met.
 const STRIDE: usize = 13;
 
@@ -729,7 +723,7 @@ fn a_cut_anywhere_leaves_the_old_or_the_new_model() {
 }
 
 #[test]
-#[ignore = "every operation, 2e5 cuts; run with --release --ignored"]
+#[ignore = "every operation, 520,000 cuts; run with --release --ignored"]
 fn a_cut_at_every_operation_leaves_the_old_or_the_new_model() {
     println!("{} cuts", all_single_cuts(1));
 }
@@ -759,19 +753,19 @@ fn every_pair<const W: usize, const E: usize>(lab: fn(&Models, Start) -> Lab<W, 
 }
 
 #[test]
-#[ignore = "every pair of operations, 1.2e6; run with --release --ignored"]
+#[ignore = "every pair of operations, 1,186,609; run with --release --ignored"]
 fn every_pair_of_cuts_with_words_leaves_the_old_or_the_new_model() {
     every_pair(words, Start::Retired);
 }
 
 #[test]
-#[ignore = "every pair of operations, 1.2e6; run with --release --ignored"]
+#[ignore = "every pair of operations, 1,186,609; run with --release --ignored"]
 fn every_pair_of_cuts_with_bytes_leaves_the_old_or_the_new_model() {
     every_pair(bytes, Start::Retired);
 }
 
 #[test]
-#[ignore = "every pair of operations, 6e6; run with --release --ignored"]
+#[ignore = "every pair of operations, 7,158,912; run with --release --ignored"]
 fn every_pair_of_cuts_with_small_sectors_leaves_the_old_or_the_new_model() {
     for start in STARTS {
         every_pair(small, start);
@@ -782,7 +776,7 @@ fn every_pair_of_cuts_with_small_sectors_leaves_the_old_or_the_new_model() {
 const PAIRS: u64 = 100_000;
 
 #[test]
-#[ignore = "1e5 pairs for each blob and flash; run with --release --ignored"]
+#[ignore = "100,000 pairs for each blob and flash; run with --release --ignored"]
 fn random_pairs_of_cuts_leave_the_old_or_the_new_model() {
     for models in &Models::all()[1..] {
         let [words, bytes] = std::thread::scope(|scope| {
@@ -816,8 +810,6 @@ fn many_cuts_in_a_row_leave_the_old_or_the_new_model() {
     println!("{count} cuts");
 }
 
-// Mutations ---------------------------------------------------------------------------------------
-
 #[test]
 fn a_slot_that_is_made_wrong_is_noticed() {
     let models = &Models::all()[0];
@@ -842,9 +834,7 @@ fn a_slot_that_is_made_wrong_is_noticed() {
     with(Mutation::BlindHash).single_cuts(1, 1).unwrap();
 }
 
-// Words that read as this now and as that later ---------------------------------------------------
-
-/// The contents before and after `cell` of slot B is given other bytes.
+/// The contents, but other bytes in a cell of slot B.
 fn with_cell<const W: usize, const E: usize>(
     lab: &Lab<W, E>,
     image: &[u8],
@@ -933,8 +923,6 @@ fn what_a_boot_has_decided_stays_decided() {
     }
     lab.no_misuse();
 }
-
-// Promises without cuts ---------------------------------------------------------------------------
 
 #[test]
 fn the_bytes_are_as_specified() {
