@@ -676,14 +676,8 @@ impl<F: NorFlash> Slots<F> {
         let mut candidates = [(Side::A, a), (Side::B, b)];
         candidates.sort_unstable_by_key(|(_, record)| key(record));
 
-        let mut boot = Boot {
-            running: Which::Factory,
-            payload: None,
-            trial,
-            floor: lowest,
-            refused: [None, None],
-        };
-        boot.floor = slots.floor;
+        let (running, floor, refused) = (Which::Factory, slots.floor, [None, None]);
+        let mut boot = Boot { running, payload: None, trial, floor, refused };
         for (side, record) in candidates {
             if boot.payload.is_some() && record.is_ok() {
                 continue;
