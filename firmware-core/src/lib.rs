@@ -36,6 +36,7 @@
 //! | [`predictor`] | `Predictor` (immutable) and `PredictorState`: step, rollout, held inputs |
 //! | `registers`, `kernel` (private) | where the numbers of a step lie, and how it computes them |
 //! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
+//! | [`slots`] | two flash slots for models: write, trial, confirm, revert |
 //! | [`link`] | messages between host and controller over a serial line |
 //! | [`device`] | encoders, position sensors and the clock, as traits |
 //! | [`cost`] | instructions and bytes of a model, before it is flashed |
@@ -69,6 +70,7 @@ pub mod model;
 pub mod predictor;
 mod registers;
 mod scalar;
+pub mod slots;
 pub mod sparse;
 
 pub use blob::{parse, parse_for, parse_prefix};
