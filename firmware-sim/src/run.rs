@@ -29,7 +29,7 @@ pub mod summary;
 pub mod sweep;
 
 use crate::bench::{RosbotBench, SoftLegBench};
-use crate::fault::{FaultKind, Faults};
+use crate::fault::{Fault, FaultKind, Faults};
 use crate::faulty::FaultyHost;
 use crate::mcu::misuse::Misuse;
 use crate::mcu::uart::{self, UartEnd, UartSettings};
@@ -97,6 +97,25 @@ impl Robot {
             Self::Rosbot => RosbotBench::AHEAD as u32,
             Self::SoftLeg => SoftLegBench::AHEAD as u32,
         }
+    }
+
+    /// Whether a fault can act on this robot, in the unit that it names.
+    pub fn feels(self, fault: &Fault) -> bool {
+        use FaultKind::*;
+        let coordinates = match self {
+            Self::Rosbot => 3,
+            Self::SoftLeg => 2,
+        };
+        let units = match (fault.kind(), self) {
+            (Nan | Spike, _) => coordinates,
+            (MissedCounts | Wrap | Slip, Self::Rosbot) => 2,
+            (StuckValve | OpenValve | Leak | Pump, Self::SoftLeg) => 2,
+            (MissedCounts | Wrap | Slip, Self::SoftLeg)
+            | (StuckValve | OpenValve | Leak | Pump, Self::Rosbot) => return false,
+            // They have no units.
+            (Dropout | Freeze | Delay | Sag | LateTick | Silence | BrownOut, _) => 0,
+        };
+        fault.unit().is_none_or(|unit| unit < units)
     }
 
     /// Random commands stay within this (rad/s, V).
@@ -182,6 +201,14 @@ pub enum RunError {
         /// That of the model (s).
         found_s: f32,
     },
+    /// A fault that the robot cannot have.
+    #[error("{fault}: a {robot} has no such fault, or no such unit")]
+    Fault {
+        /// The fault.
+        fault: Fault,
+        /// Name of the robot.
+        robot: String,
+    },
     /// The firmware refuses the model.
     #[error("the control loop refuses the model: {0:?}")]
     Firmware(ControlLoopError),
@@ -264,6 +291,10 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     let found_s = model.structure().sample_time_s();
     if (f64::from(found_s) - expected_s).abs() > 1e-3 * expected_s {
         return Err(RunError::SampleTime { expected_s, found_s });
+    }
+    if let Some(fault) = scenario.faults.iter().find(|fault| !robot.feels(&fault.0)) {
+        let robot = model.structure().robot().to_owned();
+        return Err(RunError::Fault { fault: fault.0, robot });
     }
     let mut rig = R::new();
     let clock = rig.clock();

@@ -330,7 +330,9 @@ proptest! {
     ) {
         for model in models() {
             let mut scenario = driving(&model, 10.0, &[]);
-            scenario.faults = faults.iter().copied().map(FaultText).collect();
+            let robot = Robot::of(model.structure()).unwrap();
+            let felt = faults.iter().copied().filter(|fault| robot.feels(fault));
+            scenario.faults = felt.map(FaultText).collect();
             scenario.restart = restart;
             scenario.line.loss = loss;
             let summary = quiet(&model, &scenario, seed);

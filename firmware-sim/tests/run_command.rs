@@ -99,6 +99,11 @@ fn mistakes_get_one_line_and_leave_nothing_behind() {
             "run.svg: cannot be written",
         ),
         (&["run", ROSBOT, "--log", "."], "give another folder"),
+        (
+            &["run", ROSBOT, "--faults", "leak@1..2=1"],
+            "leak@1..2=1: a skid-rosbot has no such fault",
+        ),
+        (&["run", SOFT_LEG, "--faults", "leak:2@1..2=1"], "or no such unit"),
         (&["sweep", "none.bin"], "none.bin: cannot be read"),
     ] {
         let said = refuse(folder, arguments);
