@@ -64,7 +64,7 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use crate::Scalar;
 use crate::capacity::MAX_STATES;
 use crate::error_bounds::{ErrorBounds, ErrorBoundsError};
-use crate::model::{Model, ModelError, ModelRepr, Space, Structure};
+use crate::model::{Model, ModelError, ModelRepr, Structure};
 use crate::predictor::{PredictError, Predictor, PredictorState};
 use crate::sparse::SparseTerms;
 
@@ -247,10 +247,7 @@ impl<'a> SelfTest<'a> {
         }
         let expected = self.expected.iter().zip(self.tolerance);
         predicted.iter().zip(states).zip(expected).position(|((p, state), (e, tolerance))| {
-            let difference = match state.space {
-                Space::Line => *p - *e,
-                Space::Circle => (*p - *e).wrap(),
-            };
+            let difference = state.space.difference(*p, *e);
             !(Scalar::abs(difference) <= *tolerance && tolerance.is_finite())
         })
     }

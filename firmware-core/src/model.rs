@@ -23,6 +23,25 @@ pub enum Space {
     Circle,
 }
 
+impl Space {
+    /// `to` − `from`, the short way round on S¹: in (−π, π].
+    ///
+    /// ```
+    /// use firmware_core::model::Space;
+    /// assert_eq!(Space::Line.difference(3.0, -3.0), 6.0);
+    /// let short = Space::Circle.difference(3.0, -3.0);
+    /// assert!((short - (6.0 - core::f64::consts::TAU)).abs() < 1e-15);
+    /// ```
+    #[inline]
+    pub fn difference<S: Scalar>(self, to: S, from: S) -> S {
+        let difference = to - from;
+        match self {
+            Self::Line => difference,
+            Self::Circle => difference.wrap(),
+        }
+    }
+}
+
 /// What the operator's output for a coordinate stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Target {

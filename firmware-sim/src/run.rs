@@ -232,8 +232,6 @@ pub struct Seen<'s> {
     pub truth: &'s [f64],
     /// What the loop predicted then for the coming samples, shape `[ahead, states]`.
     pub path: &'s [f32],
-    /// The faults that were active.
-    pub faults: &'s Faults,
 }
 
 /// Whoever watches a run.
@@ -249,24 +247,20 @@ pub fn run(
     seed: u64,
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
-    let robot = Robot::of(model.structure())?;
-    scenario.check(model.structure().inputs().len())?;
-    let laptop = |end, faults: &Faults| Alone {
-        end: FaultyHost::new(end, faults),
-        host: Host::new(scenario, robot.tick_us(), seed),
-    };
-    with(model, robot, scenario, seed, laptop, watcher)
+    let laptop = |end, faults: &Faults, host| Alone { end: FaultyHost::new(end, faults), host };
+    with(model, scenario, seed, laptop, watcher)
 }
 
-/// Runs a model with somebody at the other end of the line.
+/// Runs a model with somebody at the other end of the line, who is given that end and a host.
 fn with<L: Laptop>(
     model: &Model<'_>,
-    robot: Robot,
     scenario: &Scenario,
     seed: u64,
-    laptop: impl FnOnce(UartEnd, &Faults) -> L,
+    laptop: impl FnOnce(UartEnd, &Faults, Host) -> L,
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
+    let robot = Robot::of(model.structure())?;
+    scenario.check(model.structure().inputs().len())?;
     let run = (robot, scenario, seed);
     match robot {
         Robot::Rosbot => run_rig::<RosbotBench, L, 3>(model, run, laptop, watcher),
@@ -284,7 +278,7 @@ struct Then<const N: usize> {
 fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     model: &Model<'_>,
     (robot, scenario, seed): (Robot, &Scenario, u64),
-    laptop: impl FnOnce(UartEnd, &Faults) -> L,
+    laptop: impl FnOnce(UartEnd, &Faults, Host) -> L,
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
     let expected_s = (R::TICK_US * R::TICKS_PER_SAMPLE) as f64 / 1e6;
@@ -306,7 +300,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
         ..UartSettings::default()
     };
     let (host_end, mut serial) = uart::pair(&clock, line, seed);
-    let mut host = laptop(host_end, &faults);
+    let mut host = laptop(host_end, &faults, Host::new(scenario, R::TICK_US, seed));
     let supply = Wire::new(SUPPLY_VOLT);
     let mut detector = BrownOutDetector::new(&supply, BROWN_OUT_VOLT, 0.1);
 
@@ -317,6 +311,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     let ticks = (scenario.seconds * 1e6 / R::TICK_US as f64).round().max(1.0) as u64;
     let mut summary = Watch::<N>::new(model, robot, scenario, seed, cost_us);
     let mut pending: VecDeque<Then<N>> = VecDeque::new();
+    let lag = model.structure().lag() as u64;
     let mut boots = 0;
     let mut tick = 0;
 
@@ -327,8 +322,6 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
         let mut firmware = None;
         let mut producer = Some(producer);
         let (mut port, mut of_boot) = (Port::new(), 0);
-        // What the last tick could not finish in its own time.
-        let mut history = 0;
         while tick < ticks {
             // Timers go on while a tick is late: it begins when it can.
             let due_us = tick * R::TICK_US + faults.late_by_us(R::TICK_US);
@@ -344,7 +337,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
                     return Ok(());
                 };
                 summary.sample(model, frame, &then.truth);
-                watcher(&Seen { frame, truth: &then.truth, path: &then.path, faults: &faults })
+                watcher(&Seen { frame, truth: &then.truth, path: &then.path })
             });
             seen?;
             tick += 1;
@@ -367,6 +360,8 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             let began_us = clock.now_ns() / 1000;
             port.receive(&mut serial, |command| firmware.command(command));
             let is_sample = of_boot % R::TICKS_PER_SAMPLE == 0;
+            // While the model's history fills there is nothing to predict.
+            let predicts = is_sample && of_boot / R::TICKS_PER_SAMPLE >= lag;
             of_boot += 1;
             let truth = rig.truth();
             firmware.tick(began_us);
@@ -376,10 +371,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
                     pending.pop_front();
                 }
                 pending.push_back(Then { time_us: began_us, truth, path });
-                history += 1;
             }
-            // While the model's history fills there is nothing to predict.
-            let predicts = is_sample && history > model.structure().lag();
             rig.advance_us(cost_us[usize::from(!predicts)]);
             let ended_us = clock.now_ns() / 1000;
             let mode = firmware.finish(ended_us);

@@ -82,7 +82,7 @@ fn a_recording_over_the_line_is_that_of_the_run() {
         let mut line = Port::open(&port, 576_000).unwrap();
         let mut recorder = Recorder::new(&recorded, &robot).unwrap();
         let until = Instant::now() + Duration::from_millis(800);
-        let heard = listen(&mut line, &robot, Some(until), &mut |frame, _| recorder.frame(frame));
+        let heard = listen(&mut line, &robot, Some(until), &mut |frame| recorder.frame(frame));
         let heard = heard.unwrap();
         drop(line);
         let summary = thread.join().unwrap();

@@ -8,10 +8,9 @@
 //! like them stays within it with a probability of at least the coverage c. Blocks of one
 //! trajectory are not independent of each other; the guarantee then is as good as they are alike.
 
-use firmware_core::Scalar;
 use firmware_core::blob::{self, EmitError, SelfTest};
 use firmware_core::error_bounds::ErrorBounds;
-use firmware_core::model::{Model, Space, Structure};
+use firmware_core::model::{Model, Structure};
 use serde::Serialize;
 
 use crate::arx::MAX_LAGS;
@@ -106,12 +105,8 @@ impl Residuals {
         horizon: usize,
         least: usize,
     ) -> Result<Self, ConformalError> {
-        let n = model.structure().states().len();
-        let (unit, long) = Self::units_of(model.structure(), trajectories, horizon, least)?;
-        let mut residuals = Self { unit, states: n, horizon, errors: Vec::new(), diverged: 0 };
-        for t in long {
-            residuals.add(model, t);
-        }
+        let mut residuals = Self::empty(model.structure(), trajectories, horizon, least)?;
+        trajectories.iter().for_each(|t| residuals.add(model, t));
         Ok(residuals)
     }
 
@@ -120,32 +115,35 @@ impl Residuals {
         structure.lag().max(MAX_LAGS)
     }
 
-    /// What the units are, and the trajectories that are long enough for one.
-    pub(crate) fn units_of<'t>(
+    /// None yet; what the units will be is decided by how many of all trajectories are long enough.
+    pub(crate) fn empty(
         structure: &Structure<'_>,
-        trajectories: &'t [Trajectory],
+        trajectories: &[Trajectory],
         horizon: usize,
         least: usize,
-    ) -> Result<(Unit, Vec<&'t Trajectory>), ConformalError> {
+    ) -> Result<Self, ConformalError> {
         let first = Self::before(structure);
         let need = first + 1 + horizon;
-        let rows = |t: &Trajectory| t.states.len() / structure.states().len().max(1);
-        let long: Vec<&Trajectory> = trajectories.iter().filter(|t| rows(t) >= need).collect();
-        if long.is_empty() {
+        let states = structure.states().len();
+        let rows = |t: &Trajectory| t.states.len() / states.max(1);
+        let long = trajectories.iter().filter(|t| rows(t) >= need).count();
+        if long == 0 {
             return Err(ConformalError::NoWindow { need, first });
         }
-        Ok((if long.len() >= least { Unit::Trajectory } else { Unit::Block }, long))
+        let unit = if long >= least { Unit::Trajectory } else { Unit::Block };
+        Ok(Self { unit, states, horizon, errors: Vec::new(), diverged: 0 })
     }
 
-    /// The units of one more trajectory, which is long enough.
+    /// The units of one more trajectory; one that is too short has none.
     pub(crate) fn add(&mut self, model: &Model<'_>, t: &Trajectory) {
         let (structure, n) = (model.structure(), self.states);
         let (m, first) = (structure.inputs().len(), Self::before(structure));
         let need = first + 1 + self.horizon;
         let mut predicted = vec![0.0; self.horizon * n];
+        let blocks = t.states.len() / n.max(1) / need;
         let starts = match self.unit {
-            Unit::Trajectory => 1,
-            Unit::Block => t.states.len() / n.max(1) / need,
+            Unit::Trajectory => blocks.min(1),
+            Unit::Block => blocks,
         };
         for start in (0..starts).map(|block| block * need) {
             let row = |k: usize| [&t.states[k * n..][..n], &t.inputs[k * m..][..m]].concat();
@@ -158,11 +156,7 @@ impl Residuals {
             }
             for (p, x) in predicted.chunks_exact(n).zip(future) {
                 for (i, state) in structure.states().iter().enumerate() {
-                    let error = match state.space {
-                        Space::Line => p[i] - x[i],
-                        Space::Circle => (p[i] - x[i]).wrap(),
-                    };
-                    self.errors.push(error.abs());
+                    self.errors.push(state.space.difference(p[i], x[i]).abs());
                 }
             }
         }

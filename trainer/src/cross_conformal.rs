@@ -90,13 +90,9 @@ impl CrossResiduals {
                 CrossConformalError::Model { fold: fold + 1, error }
             })?;
             // Whether there are enough trajectories is asked of all, not of one fold.
-            let (unit, long) =
-                Residuals::units_of(model.structure(), trajectories, horizon, least)?;
-            let mut own = Residuals { unit, states, horizon, errors: Vec::new(), diverged: 0 };
-            for (_, t) in trajectories.iter().enumerate().filter(|(i, _)| i % folds == fold) {
-                if long.iter().any(|l| std::ptr::eq(*l, t)) {
-                    own.add(&model, t);
-                }
+            let mut own = Residuals::empty(model.structure(), trajectories, horizon, least)?;
+            for t in trajectories.iter().skip(fold).step_by(folds) {
+                own.add(&model, t);
             }
             residuals.push(own);
         }

@@ -9,7 +9,6 @@
 //! | SINDy by LASSO or thresholded least squares | [`sindy`](crate::sindy) |
 //! | linear ARX, no motion | [`arx`](crate::arx) |
 
-use firmware_core::Scalar;
 use firmware_core::model::Space;
 
 use crate::trajectory::{InMemory, Trajectory};
@@ -143,10 +142,7 @@ pub struct Evaluation {
 pub fn evaluate(method: &(impl Forecast + ?Sized), test: Data<'_>, steps: usize) -> Evaluation {
     let (n, m) = (test.spaces.len(), test.inputs);
     let square = |i: usize, predicted: f64, measured: f64| {
-        let error = match test.spaces[i] {
-            Space::Line => predicted - measured,
-            Space::Circle => (predicted - measured).wrap(),
-        };
+        let error = test.spaces[i].difference(predicted, measured);
         error * error
     };
     let mut one_step = vec![0.0; n];

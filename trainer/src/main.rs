@@ -19,7 +19,7 @@ use trainer::figures;
 use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
 use trainer::monitor::{Port, Recorder, listen, picture};
-use trainer::recording::{LogColumn, LogSchema, Recording, Visitor};
+use trainer::recording::{LogColumn, LogSchema, Recording};
 use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
 use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
 use trainer::resample::{InputResampling, ResamplePlan, resample};
@@ -30,7 +30,7 @@ use trainer::select::{self, Budget};
 use trainer::spectrum_report::SpectrumReport;
 use trainer::stability::Stability;
 use trainer::topology::{Orders, lifting};
-use trainer::trajectory::{Logs, Trajectories, collect, collect_named};
+use trainer::trajectory::{Logs, Trajectory, collect, collect_named, collect_summed_up};
 
 /// Fits Koopman models to robot logs and writes them as blobs that a microcontroller reads.
 #[derive(Parser)]
@@ -835,8 +835,9 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
     let least = least_units(args.coverage)?;
     let recording = Recording::open(&args.logs)?;
     let source = Logs { recording: &recording, schema: &schema };
-    let seen = source.visit(&mut Unread)?.sha256 == model.structure().provenance().logs;
-    let trajectories = collect(&source)?;
+    let (trajectories, summary) = collect_summed_up(&source)?;
+    let trajectories: Vec<Trajectory> = trajectories.into_iter().map(|(_, t)| t).collect();
+    let seen = summary.sha256 == model.structure().provenance().logs;
     let (residuals, covered) = match (args.cross_validate, seen) {
         (false, false) => {
             (Residuals::measure(&model, &trajectories, options.horizon, least)?, None)
@@ -937,7 +938,7 @@ fn monitor(args: &MonitorArgs) -> Result<(), Failure> {
         write!(std::io::stdout(), "\x1b[2J")?;
     }
     let until = args.seconds.map(|s| Instant::now() + Duration::from_secs(s.into()));
-    let heard = listen(&mut port, &robot, until, &mut |frame, _| {
+    let heard = listen(&mut port, &robot, until, &mut |frame| {
         if let Some(recorder) = &mut recorder {
             recorder.frame(frame)?;
         }
@@ -974,14 +975,6 @@ fn monitor(args: &MonitorArgs) -> Result<(), Failure> {
         )));
     }
     Ok(())
-}
-
-/// Reads logs for their checksum alone.
-struct Unread;
-
-impl Visitor for Unread {
-    fn begin(&mut self, _: &str) {}
-    fn row(&mut self, _: &[f64], _: &[f64]) {}
 }
 
 /// `stability --json`.

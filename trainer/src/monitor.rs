@@ -176,7 +176,7 @@ pub fn listen(
     port: &mut Port,
     robot: &Robot,
     until: Option<Instant>,
-    watch: &mut dyn FnMut(&Frame, &Heard) -> io::Result<()>,
+    watch: &mut dyn FnMut(&Frame) -> io::Result<()>,
 ) -> io::Result<Heard> {
     let (mut receiver, mut heard) = (Receiver::new(), Heard::default());
     let (mut next, mut first) = (None, true);
@@ -209,7 +209,7 @@ pub fn listen(
                         heard.lost += u64::from(frame.sequence - expected);
                     }
                     next = Some(frame.sequence.wrapping_add(1));
-                    watch(&frame, &heard)?;
+                    watch(&frame)?;
                 }
                 Received::Message(_) => {}
                 Received::Damaged => heard.damaged += u64::from(!was_first),

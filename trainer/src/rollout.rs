@@ -92,14 +92,6 @@ pub fn roll_out<S: Real>(
     Ok(state)
 }
 
-/// Predicted minus measured, the short way round on S¹.
-pub fn error(space: Space, predicted: f64, measured: f64) -> f64 {
-    match space {
-        Space::Line => predicted - measured,
-        Space::Circle => (predicted - measured).wrap(),
-    }
-}
-
 /// Why there are no errors over test logs.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -202,7 +194,7 @@ impl TestReport {
                 }
                 let measured = &t.states[(lag + 1) * n..];
                 for (k, (p, x)) in predicted.iter().zip(measured).enumerate() {
-                    let error = error(structure.states()[k % n].space, *p, *x);
+                    let error = structure.states()[k % n].space.difference(*p, *x);
                     sums[k % n] += error * error;
                 }
             }

@@ -791,10 +791,7 @@ impl Scorer<'_, '_, '_> {
             errors.windows += 1;
             for (step, (row, measured)) in predicted.chunks_exact(n).zip(future).enumerate() {
                 for (i, (p, x)) in row.iter().zip(measured).enumerate() {
-                    let error = match structure.states()[i].space {
-                        Space::Line => p - x,
-                        Space::Circle => (p - x).wrap(),
-                    };
+                    let error = structure.states()[i].space.difference(*p, *x);
                     let square = error * error;
                     errors.rollout[i] += square;
                     if step == 0 {

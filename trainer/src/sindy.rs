@@ -323,11 +323,7 @@ impl<'d> Columns<'d> {
     }
 
     fn velocity(&self, i: usize, (x, _, next): Pair<'_>) -> f64 {
-        let difference = match self.spaces[i] {
-            Space::Line => next[i] - x[i],
-            Space::Circle => (next[i] - x[i]).wrap(),
-        };
-        difference / self.sample_time_s
+        self.spaces[i].difference(next[i], x[i]) / self.sample_time_s
     }
 
     fn gram<'p>(&self, mut pairs: impl Iterator<Item = Pair<'p>>) -> Gram {

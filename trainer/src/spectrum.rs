@@ -8,8 +8,8 @@
 
 use faer::linalg::solvers::DenseSolveCore;
 use faer::{Mat, c64};
-use firmware_core::model::{Model, ModelError, Space};
-use firmware_core::{Predictor, PredictorState, Scalar};
+use firmware_core::model::{Model, ModelError};
+use firmware_core::{Predictor, PredictorState};
 
 /// An eigenvalue with a larger [condition](Decomposition::conditions) is reported as defective or
 /// nearly so. Rounding in K moves such an eigenvalue by more than 1e6 ε = 2e-10 of K, and that times
@@ -577,10 +577,7 @@ pub fn eigenvalues(
         low[j] -= step;
         let (Some(high), Some(low)) = (next(&high), next(&low)) else { return Ok(Vec::new()) };
         for i in 0..n {
-            let change = match structure.states()[i].space {
-                Space::Line => high[i] - low[i],
-                Space::Circle => (high[i] - low[i]).wrap(),
-            };
+            let change = structure.states()[i].space.difference(high[i], low[i]);
             jacobian[(size - n + i, j)] = change / (2.0 * step);
         }
     }

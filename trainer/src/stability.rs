@@ -22,7 +22,7 @@ use serde::Serialize;
 use crate::edmd::Spread;
 use crate::report::significant;
 use crate::robot::ScoreOptions;
-use crate::rollout::{error, input, observe, roll_out};
+use crate::rollout::{input, observe, roll_out};
 use crate::spectrum::radius;
 use crate::terms::Names;
 use crate::trajectory::Trajectory;
@@ -559,7 +559,7 @@ impl<'m, 'a> Linear<'m, 'a> {
             let width = above[j] - below[j];
             for (i, (a, b)) in next(&above)?.iter().zip(next(&below)?).enumerate() {
                 let space = if a.2 { Space::Circle } else { Space::Line };
-                jacobian[(i, j)] = error(space, a.0, b.0) / width;
+                jacobian[(i, j)] = space.difference(a.0, b.0) / width;
             }
         }
         Some(jacobian)
@@ -586,7 +586,7 @@ impl<'m, 'a> Linear<'m, 'a> {
                 let width = above[k][j] - below[k][j];
                 let (Some(a), Some(b)) = (end(&above), end(&below)) else { return Vec::new() };
                 for i in 0..n {
-                    let slope = error(states[i].space, a[i], b[i]) / width;
+                    let slope = states[i].space.difference(a[i], b[i]) / width;
                     let relative = slope * self.deviations[j] / self.deviations[i];
                     squares[i] += relative * relative;
                 }
@@ -600,7 +600,8 @@ impl<'m, 'a> Linear<'m, 'a> {
 /// frame of `from`.
 fn increment(structure: &Structure<'_>, from: &[f64], to: &[f64]) -> Vec<f64> {
     let states = structure.states().iter().zip(to).zip(from);
-    let mut change: Vec<f64> = states.map(|((s, to), from)| error(s.space, *to, *from)).collect();
+    let mut change: Vec<f64> =
+        states.map(|((s, to), from)| s.space.difference(*to, *from)).collect();
     if let Symmetry::Se2 { x, y, heading } = structure.symmetry() {
         let [x, y, heading] = [x, y, heading].map(usize::from);
         let (s, c) = Scalar::sin_cos(from[heading]);

@@ -82,6 +82,17 @@ pub fn collect<T: Trajectories>(source: &T) -> Result<Vec<Trajectory>, T::Error>
 /// # Errors
 /// The source's own.
 pub fn collect_named<T: Trajectories>(source: &T) -> Result<Vec<(String, Trajectory)>, T::Error> {
+    Ok(collect_summed_up(source)?.0)
+}
+
+/// Named trajectories, and what was read.
+type SummedUp = (Vec<(String, Trajectory)>, Summary);
+
+/// The same with what was read.
+///
+/// # Errors
+/// The source's own.
+pub fn collect_summed_up<T: Trajectories>(source: &T) -> Result<SummedUp, T::Error> {
     struct Collector(Vec<(String, Trajectory)>);
     impl Visitor for Collector {
         fn begin(&mut self, name: &str) {
@@ -95,6 +106,6 @@ pub fn collect_named<T: Trajectories>(source: &T) -> Result<Vec<(String, Traject
         }
     }
     let mut collector = Collector(Vec::new());
-    source.visit(&mut collector)?;
-    Ok(collector.0)
+    let summary = source.visit(&mut collector)?;
+    Ok((collector.0, summary))
 }

@@ -146,9 +146,8 @@ impl Default for RosbotSettings {
 /// Ticks in a row that an encoder may be unreadable or implausible.
 const BAD_COUNTS: u8 = 5;
 /// A motor that has had the stall voltage for so long (s) while its wheel was not counted to turn its way by
-/// as much as the stall speed (rad/s), and was off by more than twice that, has a dead or swapped encoder,
-/// or is blocked: the integral of its controller would drive it to full voltage. One that brakes downhill
-/// is as fast as commanded.
+/// as much as the stall speed (rad/s) has a dead or swapped encoder, or is blocked: the integral of its
+/// controller would drive it to full voltage. One that has to brake so hard for so long is stopped, too.
 const STALL_S: f32 = 0.3;
 const STALL_RADPS: f32 = 0.5;
 /// Share of the newest sample in the mean deviation of a wheel's speed: about ten samples.
@@ -350,14 +349,15 @@ where
             if self.counted && speed.abs() <= settings.fastest_radps {
                 side.speed = speed;
             } else {
-                // The last speed is the best guess; the first count of all is nothing to go by.
+                // The last speed is the best guess.
                 plausible = false;
             }
         }
-        if plausible || !self.counted {
-            self.bad_counts = if self.counted { 0 } else { self.bad_counts };
-        } else {
-            self.bad_count();
+        // The first count of all says nothing, neither good nor bad.
+        match (self.counted, plausible) {
+            (true, true) => self.bad_counts = 0,
+            (true, false) => self.bad_count(),
+            (false, _) => {}
         }
         self.counted = true;
     }

@@ -73,8 +73,9 @@ pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
     shadow: PredictorState,
     slow: Monitor,
     shadow_steps: u32,
-    /// Samples without a measurement that was used.
+    /// Samples without a measurement that was used, and the most of them that are allowed.
     blind: u32,
+    blind_limit: u32,
     /// Samples in a row for which nothing was predicted, and the most of them that are allowed.
     unpredicted: u32,
     unpredicted_limit: u32,
@@ -82,8 +83,6 @@ pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
     /// looks at.
     guessed: u32,
     looks_at: u32,
-    /// The most of them that are allowed.
-    blind_limit: u32,
     bad: u8,
     outliers: u8,
     path: [[f32; N]; H],
@@ -118,12 +117,12 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             slow: monitor,
             shadow_steps: reach.map_or(SHADOW, |reach| reach.min(SHADOW)),
             blind: 0,
+            blind_limit,
             unpredicted: 0,
             unpredicted_limit: blind_limit.saturating_add(fills),
             guessed: 0,
             // At least the present sample; lags are few.
             looks_at: u32::MAX >> (31 - structure.lag().min(31)),
-            blind_limit,
             bad: 0,
             outliers: 0,
             path: [[0.0; N]; H],
@@ -331,11 +330,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         let mut residual = [0.0; N];
         let pairs = measured.iter().zip(predicted).zip(self.model().structure().states());
         for (to, ((x, expected), state)) in residual.iter_mut().zip(pairs) {
-            let difference = x - expected;
-            *to = match state.space {
-                Space::Line => difference,
-                Space::Circle => difference.wrap(),
-            };
+            *to = state.space.difference(*x, *expected);
         }
         residual
     }

@@ -9,7 +9,7 @@ use crate::mcu::uart::UartEnd;
 use crate::run::host::{Counts, Host, Laptop};
 use crate::run::scenario::Scenario;
 use crate::run::summary::Summary;
-use crate::run::{Robot, RunError, with};
+use crate::run::{RunError, with};
 use embedded_io::{Read as _, ReadReady as _, Write as _};
 use firmware_core::control_loop::Frame;
 use firmware_core::link::MAX_FRAME;
@@ -190,18 +190,16 @@ pub fn serve(
     door: Door,
     (drives, speed): (bool, f64),
 ) -> Result<Summary, RunError> {
-    let robot = Robot::of(model.structure())?;
-    scenario.check(model.structure().inputs().len())?;
-    let laptop = |end, _: &Faults| Remote {
+    let laptop = |end, _: &Faults, host| Remote {
         end,
         door,
         client: None,
         incoming: Vec::new(),
         outgoing: Vec::new(),
-        host: Host::new(scenario, robot.tick_us(), seed),
+        host,
         drives,
         began: Instant::now(),
         speed,
     };
-    with(model, robot, scenario, seed, laptop, &mut |_| Ok(()))
+    with(model, scenario, seed, laptop, &mut |_| Ok(()))
 }

@@ -7,8 +7,8 @@ use crate::run::{Robot, number};
 use firmware_core::control_loop::monitor::Monitor;
 use firmware_core::control_loop::tracker::SHADOW;
 use firmware_core::control_loop::{Alarms, Frame, Mode};
-use firmware_core::model::{Model, Space};
-use firmware_core::{Predictor, PredictorState, Scalar};
+use firmware_core::model::Model;
+use firmware_core::{Predictor, PredictorState};
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::fmt::Write as _;
@@ -295,11 +295,7 @@ impl<const N: usize> Watch<N> {
         let error: Option<[f32; N]> = (running && frame.predicted.len() == N).then(|| {
             std::array::from_fn(|i| {
                 let predicted = f64::from(frame.predicted[i]);
-                let difference = truth[i] - predicted;
-                match structure.states()[i].space {
-                    Space::Line => difference as f32,
-                    Space::Circle => difference.wrap() as f32,
-                }
+                structure.states()[i].space.difference(truth[i], predicted) as f32
             })
         });
         let bounds = model.error_bounds();
@@ -362,11 +358,9 @@ impl<const N: usize> Watch<N> {
             }
             for (which, _) in self.horizons.iter().enumerate().filter(|(_, h)| **h == step) {
                 for i in 0..N {
-                    let difference = f64::from(measured[i]) - f64::from(predicted[i]);
-                    let error = match model.structure().states()[i].space {
-                        Space::Line => difference,
-                        Space::Circle => difference.wrap(),
-                    };
+                    let (measured, predicted) = (measured[i].into(), predicted[i].into());
+                    let space = model.structure().states()[i].space;
+                    let error: f64 = space.difference(measured, predicted);
                     squares[which][i] += error * error;
                 }
             }
