@@ -53,6 +53,38 @@ pub enum Command<const M: usize> {
     Reset,
 }
 
+/// The loop of a robot with `M` inputs, as a firmware runs it.
+pub trait ControlLoop<const M: usize> {
+    /// What the host asks for.
+    fn command(&mut self, command: Command<M>);
+
+    /// One tick, which begins at `now_us`.
+    fn tick(&mut self, now_us: u64) -> Mode;
+
+    /// The tick is over: was it in time? If not, or after a stop during the tick, the actuators go off at
+    /// once.
+    fn finish(&mut self, now_us: u64) -> Mode;
+
+    /// Where the robot will be at the coming samples, shape `[samples, states]` (model's units).
+    fn path(&self) -> &[f32];
+
+    /// Its state machine.
+    fn supervisor(&self) -> &Supervisor;
+
+    /// Its state machine, to be [held](Supervisor::hold).
+    fn supervisor_mut(&mut self) -> &mut Supervisor;
+
+    /// What the loop may do.
+    fn mode(&self) -> Mode {
+        self.supervisor().mode()
+    }
+
+    /// What was noticed since the last start or reset.
+    fn alarms(&self) -> Alarms {
+        self.supervisor().alarms()
+    }
+}
+
 /// Everything that moves the robot.
 ///
 /// An implementation that cannot say whether it succeeded does both: it tries everything, and returns

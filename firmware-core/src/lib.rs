@@ -38,6 +38,7 @@
 //! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
 //! | [`slots`] | two flash slots for models: write, trial, confirm, revert |
 //! | [`link`] | messages between host and controller over a serial line |
+//! | [`update`] | installing a new model over that line: sessions, signatures, trial |
 //! | [`device`] | encoders, position sensors and the clock, as traits |
 //! | [`cost`] | instructions and bytes of a model, before it is flashed |
 //! | [`capacity`] | what there is room for |
@@ -72,6 +73,7 @@ mod registers;
 mod scalar;
 pub mod slots;
 pub mod sparse;
+pub mod update;
 
 pub use blob::{parse, parse_for, parse_prefix};
 pub use error_bounds::ErrorBounds;

@@ -8,8 +8,10 @@
 //! COBS( postcard(message) ‖ CRC-32 ) ‖ 00
 //! ```
 //!
-//! so that a receiver that lost or mistook bytes is in step again after the next zero. A frame that is too
-//! long, does not unstuff, or has a wrong checksum is dropped and counted; nothing is guessed.
+//! so that a receiver that lost or mistook bytes is in step again after the next zero. A frame that does not
+//! unstuff, or has a wrong checksum, is dropped and counted; nothing is guessed. A controller answers one
+//! that is too long, and one whose message it does not know, with
+//! [`Refused`](crate::update::Refused).
 //!
 //! | variant | message | direction |
 //! |---|---|---|
@@ -18,19 +20,26 @@
 //! | 2 | [`Message::Reset`] | to the controller |
 //! | 3 | [`Message::Inputs`] | to the controller |
 //! | 4 | [`Message::Frame`] | to the host |
+//! | 5 | [`Message::Request`] | to the controller |
+//! | 6 | [`Message::Answer`] | to the host |
+//!
+//! The whole, byte by byte: docs/protocol.md.
 
 use embedded_io::{Read, ReadReady, Write, WriteReady};
-use heapless::Vec;
+use heapless::{Deque, Vec};
 use serde::{Deserialize, Serialize};
 
 use crate::blob::CRC;
 use crate::capacity::MAX_INPUTS;
-use crate::control_loop::Command;
 use crate::control_loop::telemetry::{Frame, Frames};
+use crate::control_loop::{Command, ControlLoop, Mode};
+use crate::update::{Answer, Refused, Request, Say, Updates};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
-/// room for takes 204 bytes.
+/// room for takes 204 bytes, the longest chunk of a blob 216.
 pub const MAX_FRAME: usize = 256;
+/// Number of [`Message::Request`].
+pub(crate) const REQUEST: u8 = 5;
 
 /// What goes over the line.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -47,6 +56,10 @@ pub enum Message {
     Inputs(Vec<f32, MAX_INPUTS>),
     /// One sample of a loop.
     Frame(Frame),
+    /// About models: [`update`](crate::update).
+    Request(Request),
+    /// To a request, or to what is none.
+    Answer(Answer),
 }
 
 impl<const M: usize> From<Command<M>> for Message {
@@ -69,7 +82,7 @@ impl Message {
             Self::Stop => Some(Command::Stop),
             Self::Reset => Some(Command::Reset),
             Self::Inputs(inputs) => Some(Command::Inputs(inputs.as_slice().try_into().ok()?)),
-            Self::Frame(_) => None,
+            Self::Frame(_) | Self::Request(_) | Self::Answer(_) => None,
         }
     }
 }
@@ -112,7 +125,16 @@ pub struct TooLong;
 pub enum Received {
     /// A message.
     Message(Message),
-    /// A frame that is dropped: too long, damaged, or no message.
+    /// A frame with a right checksum that holds no message known here.
+    Unknown {
+        /// Its first byte.
+        variant: u8,
+        /// Number of a request, as far as it is one; 0.
+        number: u8,
+    },
+    /// A frame that is longer than [`MAX_FRAME`].
+    TooLong,
+    /// A damaged frame.
     Damaged,
 }
 
@@ -149,33 +171,49 @@ impl Receiver {
         if length == 0 {
             return None;
         }
-        let message = self.frame.get_mut(..length).and_then(decode);
-        Some(message.map_or(Received::Damaged, Received::Message))
+        if length >= MAX_FRAME {
+            return Some(Received::TooLong);
+        }
+        let received = self.frame.get_mut(..length).and_then(decode);
+        Some(received.unwrap_or(Received::Damaged))
     }
 }
 
-/// The message of a frame without its final zero.
-fn decode(frame: &mut [u8]) -> Option<Message> {
+/// What a frame without its final zero holds; `None` of one that is damaged.
+fn decode(frame: &mut [u8]) -> Option<Received> {
     let length = cobs::decode_in_place(frame).ok()?;
     let (body, check) = frame.get(..length)?.split_last_chunk::<4>()?;
     if CRC.checksum(body) != u32::from_le_bytes(*check) {
         return None;
     }
     // Bytes after a message are no part of any.
-    postcard::take_from_bytes(body).ok().filter(|(_, rest)| rest.is_empty()).map(|(m, _)| m)
+    let message = postcard::take_from_bytes(body).ok().filter(|(_, rest)| rest.is_empty());
+    Some(message.map_or_else(
+        || {
+            let variant = body.first().copied().unwrap_or(0);
+            let number = body.get(1).copied().filter(|_| variant == REQUEST).unwrap_or(0);
+            Received::Unknown { variant, number }
+        },
+        |(message, _)| Received::Message(message),
+    ))
 }
 
 /// Reads at most this many bytes per call: bounded work, whatever the line brings.
 const READ: usize = 128;
+/// Answers that wait to be sent; further ones are dropped, as the host asks again.
+const ANSWERS: usize = 2;
 
-/// One end of the line at a controller: commands in, frames out, never waiting.
+/// One end of the line at a controller: commands and requests in, answers and frames out, never waiting.
 #[derive(Clone, Debug)]
 pub struct Port {
     receiver: Receiver,
+    answers: Deque<Answer, ANSWERS>,
     /// The frame that is being sent, its length and how much of it is on the way.
     out: [u8; MAX_FRAME],
     length: usize,
     sent: usize,
+    /// Whether the last one was an answer: then it is the turn of a frame, however much is asked.
+    answered: bool,
     damaged: u32,
 }
 
@@ -188,46 +226,112 @@ impl Default for Port {
 impl Port {
     /// Nothing received or sent.
     pub fn new() -> Self {
-        Self { receiver: Receiver::new(), out: [0; MAX_FRAME], length: 0, sent: 0, damaged: 0 }
+        Self {
+            receiver: Receiver::new(),
+            answers: Deque::new(),
+            out: [0; MAX_FRAME],
+            length: 0,
+            sent: 0,
+            answered: false,
+            damaged: 0,
+        }
     }
 
-    /// Frames dropped on the way in so far.
+    /// Frames on the way in so far that were dropped or not understood.
     pub fn damaged(&self) -> u32 {
         self.damaged
     }
 
-    /// Reads what has arrived, at most 128 bytes, and hands on each command to a robot of `M` inputs.
+    /// Whether all answers have been handed to the line.
+    pub fn is_sent(&self) -> bool {
+        self.answers.is_empty() && self.sent == self.length
+    }
+
+    /// Reads what has arrived, at most 128 bytes, and hands on commands to the loop, requests to the
+    /// updates; of what these have to do for long, a part, unless the robot runs. Between two ticks of a
+    /// robot at rest it may be called as often as there is time.
     pub fn receive<const M: usize>(
         &mut self,
         serial: &mut (impl Read + ReadReady),
-        mut command: impl FnMut(Command<M>),
+        robot: &mut (impl ControlLoop<M> + ?Sized),
+        updates: &mut impl Updates,
+        now_us: u64,
     ) {
         let mut bytes = [0; READ];
-        if !matches!(serial.read_ready(), Ok(true)) {
-            return;
-        }
-        let count = serial.read(&mut bytes).unwrap_or(0);
+        let count = match serial.read_ready() {
+            Ok(true) => serial.read(&mut bytes).unwrap_or(0),
+            _ => 0,
+        };
         for byte in bytes.iter().take(count) {
-            match self.receiver.push(*byte) {
-                Some(Received::Message(message)) => match message.command() {
-                    Some(wanted) => command(wanted),
-                    None => self.damaged = self.damaged.saturating_add(1),
-                },
-                Some(Received::Damaged) => self.damaged = self.damaged.saturating_add(1),
-                None => {}
+            let Some(received) = self.receiver.push(*byte) else { continue };
+            let answer = self.take(received, robot, updates, now_us);
+            self.answer(answer);
+        }
+        // Erasing may hold up the line: what has been said goes first.
+        if robot.mode() != Mode::Running && updates.is_working() && self.is_sent() {
+            let answer = updates.work(robot.mode(), now_us);
+            self.answer(answer);
+            robot.supervisor_mut().pause();
+        }
+        robot.supervisor_mut().hold(updates.holds(now_us));
+    }
+
+    fn take<const M: usize>(
+        &mut self,
+        received: Received,
+        robot: &mut (impl ControlLoop<M> + ?Sized),
+        updates: &mut impl Updates,
+        now_us: u64,
+    ) -> Option<Answer> {
+        let refused = |number, refused| Some(Answer { number, say: Say::Refused(refused) });
+        let unknown = |variant| refused(0, Refused::Unknown { variant });
+        let understood = match &received {
+            Received::Message(Message::Request(request)) => {
+                return updates.receive(request, robot.mode(), now_us);
             }
+            Received::Message(message) => message.command().map(|wanted| robot.command(wanted)),
+            _ => None,
+        };
+        if understood.is_some() {
+            return None;
+        }
+        self.damaged = self.damaged.saturating_add(1);
+        match received {
+            // Its number of inputs is another, or it is one for the host.
+            Received::Message(Message::Frame(_)) => unknown(4),
+            Received::Message(Message::Answer(_)) => unknown(6),
+            Received::Message(_) => unknown(3),
+            Received::Unknown { variant, number } => refused(number, Refused::Unknown { variant }),
+            Received::TooLong => {
+                let most = u32::try_from(MAX_FRAME).unwrap_or(u32::MAX);
+                refused(0, Refused::TooLong { most })
+            }
+            // Whoever sent it will see that nothing comes back.
+            Received::Damaged => None,
         }
     }
 
-    /// Sends as much of the waiting frames as the line takes now: the rest of the one on the way, and at
-    /// most one more.
+    fn answer(&mut self, answer: Option<Answer>) {
+        if let Some(answer) = answer {
+            let _ = self.answers.push_back(answer);
+        }
+    }
+
+    /// Sends as much of the waiting answers and frames as the line takes now: the rest of the one on the
+    /// way, and at most one more.
     pub fn send(&mut self, frames: &mut Frames<'_>, serial: &mut (impl Write + WriteReady)) {
         for _ in 0..2 {
             if self.sent == self.length {
-                let Some(frame) = frames.dequeue() else { return };
+                let waits = self.answered && frames.ready();
+                let answer = if waits { None } else { self.answers.pop_front() };
+                self.answered = answer.is_some();
+                let message = answer.map(Message::Answer);
+                let Some(message) = message.or_else(|| frames.dequeue().map(Message::Frame)) else {
+                    return;
+                };
                 (self.sent, self.length) = (0, 0);
-                // There is room for every frame.
-                self.length = encode(&Message::Frame(frame), &mut self.out).unwrap_or(0);
+                // There is room for every message.
+                self.length = encode(&message, &mut self.out).unwrap_or(0);
             }
             while let Some(rest) = self.out.get(self.sent..self.length).filter(|r| !r.is_empty()) {
                 if !matches!(serial.write_ready(), Ok(true)) {
@@ -256,7 +360,7 @@ mod tests {
         Message::Frame(Frame {
             sequence: u32::MAX,
             time_us: u64::MAX,
-            mode: crate::control_loop::Mode::Safe,
+            mode: Mode::Safe,
             alarms: crate::control_loop::Alarms::SAFE,
             noticed: crate::control_loop::Alarms::SAFE,
             applied: numbers.into_iter().take(MAX_INPUTS).collect(),
@@ -311,7 +415,7 @@ mod tests {
             assert!(receive(&bytes).iter().all(|r| *r == Received::Damaged));
         }
         let endless = [[1; 1000].as_slice(), &[0], &stop[..end]].concat();
-        assert_eq!(receive(&endless), [Received::Damaged, Received::Message(Message::Stop)]);
+        assert_eq!(receive(&endless), [Received::TooLong, Received::Message(Message::Stop)]);
     }
 
     proptest! {

@@ -6,10 +6,10 @@
 //! model that may run, the factory model in the image does.
 //!
 //! Erasing stalls most controllers for as long as seconds, programming for microseconds. When that is
-//! allowed is the caller's business: call [`begin`](Slots::begin), [`write`](Slots::write),
-//! [`verify`](Slots::verify), [`commit`](Slots::commit) and [`abort`](Slots::abort) only while the
-//! actuators are switched off, the loop being in Safe. [`confirm`](Slots::confirm) programs two words of 8
-//! bytes while the loop runs.
+//! allowed is the caller's business, which [`update`](crate::update) minds: call [`erase`](Slots::erase),
+//! [`write`](Slots::write), [`verify`](Slots::verify), [`commit`](Slots::commit),
+//! [`confirm`](Slots::confirm) and [`abort`](Slots::abort) only while the actuators are switched off, the
+//! loop being in Safe.
 //!
 //! # Layout
 //!
@@ -40,7 +40,7 @@
 //! # States
 //!
 //! ```text
-//!            begin: erase, header's sector first
+//!            begin, erase: header's sector first
 //!   any ───────────────► empty ──write, verify──► payload ──commit: header──► headed
 //!                                                                                │ commit: CMIT
 //!                            the other slot boots                                ▼
@@ -90,7 +90,7 @@
 //! - If the header of the confirmed slot decays, its sequence number is lost with it, and the floor
 //!   falls to that of the other slot. If only its payload does, the floor stays, an older model in the
 //!   other slot is refused, and the factory model runs until an update comes.
-//! - Sequence numbers and hashes are checked, but nobody signs them.
+//! - Sequence numbers and hashes are checked here; who may set them is [`update`](crate::update)'s business.
 //! - A flash with error correction may answer a torn word with a fault instead of an error: its driver has
 //!   to turn it into one, and the slot counts as empty.
 //!
@@ -129,6 +129,7 @@
 //! assert_eq!(boot.running, Which::Factory);
 //! let release = Release::new("rosbot", 7, blob).unwrap();
 //! slots.begin(&release).unwrap();
+//! while slots.erase().unwrap() > 0 {} // a sector at a time
 //! slots.write(0, &blob[..1000]).unwrap();
 //! assert_eq!(slots.written(), Some(1000)); // where a host that reconnects goes on
 //! slots.write(1000, &blob[1000..]).unwrap();
@@ -145,6 +146,7 @@
 use core::cmp::Reverse;
 
 use embedded_storage::nor_flash::{NorFlash, ReadNorFlash};
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::blob::CRC;
@@ -216,7 +218,7 @@ pub enum GeometryError {
 }
 
 /// Where a model comes from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Which {
     /// The first slot.
     A,
@@ -315,7 +317,7 @@ pub struct Boot<E> {
 }
 
 /// What the host says of a payload before it sends it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Release {
     /// Bytes of the payload.
     pub length: u32,
@@ -335,10 +337,10 @@ impl Release {
     }
 }
 
-/// Why an update does not begin. Nothing has been erased, except after [`Flash`](Self::Flash).
+/// Why an update does not begin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum BeginError<E> {
+pub enum BeginError {
     /// The running model is on trial: the other slot is what a revert goes back to.
     OnTrial,
     /// The payload is empty or too long.
@@ -360,15 +362,13 @@ pub enum BeginError<E> {
         /// [`robot`] of its name.
         found: u32,
     },
-    /// The flash failed.
-    Flash(E),
 }
 
 /// Why a part of a payload is not written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum WriteError<E> {
-    /// No update has begun, or it is past its verification.
+    /// No update has begun, its slot is not erased yet, or it is past its verification.
     NotWriting,
     /// The part does not begin where the one before it ended.
     OutOfOrder {
@@ -429,6 +429,11 @@ struct Header {
 }
 
 impl Header {
+    fn release(&self) -> Release {
+        let Self { length, sequence, robot, sha256, .. } = *self;
+        Release { length, sha256, sequence, robot }
+    }
+
     fn encode(&self) -> [u8; HEADER] {
         let mut bytes = [0; HEADER];
         let mut at = 0_usize;
@@ -598,6 +603,8 @@ impl Record {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Stage {
+    /// Erased up to here, an offset in the flash.
+    Erasing(u32),
     Writing,
     Verified,
     Committed,
@@ -620,7 +627,7 @@ struct Update {
 struct Running {
     side: Side,
     check: u32,
-    sequence: u32,
+    header: Header,
 }
 
 /// The two slots, after [`boot`](Self::boot) has decided which one runs.
@@ -754,7 +761,7 @@ impl<F: NorFlash> Slots<F> {
         if !accept(payload) {
             return Err(Refusal::NotAccepted);
         }
-        self.running = Some(Running { side, check: record.check, sequence });
+        self.running = Some(Running { side, check: record.check, header: record.header });
         self.trial = trial;
         Ok(payload)
     }
@@ -762,6 +769,16 @@ impl<F: NorFlash> Slots<F> {
     /// What runs.
     pub fn running(&self) -> Which {
         self.running.map_or(Which::Factory, |running| running.side.into())
+    }
+
+    /// The update that brought what runs; `None` of the factory model.
+    pub fn release(&self) -> Option<Release> {
+        self.running.map(|running| running.header.release())
+    }
+
+    /// The update that is under way.
+    pub fn update(&self) -> Option<Release> {
+        self.update.as_ref().map(|update| update.header.release())
     }
 
     /// Whether what runs is still to be [confirmed](Self::confirm).
@@ -779,10 +796,16 @@ impl<F: NorFlash> Slots<F> {
         self.geometry.slot_bytes.saturating_sub(PAYLOAD_OFFSET)
     }
 
-    /// Bytes of the payload that have been accepted, or `None` if no update is under way: where to
-    /// go on after the line was lost.
+    /// Bytes of the payload that have been accepted, or `None` if no update is under way, or not that far:
+    /// where to go on after the line was lost.
     pub fn written(&self) -> Option<u32> {
-        self.update.as_ref().map(|update| update.written)
+        let update = self.update.as_ref();
+        update.filter(|u| !matches!(u.stage, Stage::Erasing(_))).map(|update| update.written)
+    }
+
+    /// Whether the update under way has been [committed](Self::commit).
+    pub fn is_committed(&self) -> bool {
+        self.update.is_some_and(|update| update.stage == Stage::Committed)
     }
 
     /// Gives the flash back.
@@ -790,13 +813,12 @@ impl<F: NorFlash> Slots<F> {
         self.flash
     }
 
-    /// Erases the slot that does not run, for an update. An update that was under way is dropped, a
-    /// committed one that has not run yet, too.
+    /// Whether an update may begin.
     ///
     /// # Errors
-    /// [`BeginError`]; without anything erased unless the flash failed.
-    pub fn begin(&mut self, release: &Release) -> Result<(), BeginError<F::Error>> {
-        let Release { length, sha256, sequence, robot } = *release;
+    /// [`BeginError`].
+    pub fn check(&self, release: &Release) -> Result<(), BeginError> {
+        let Release { length, sequence, robot, .. } = *release;
         if self.trial {
             return Err(BeginError::OnTrial);
         }
@@ -809,7 +831,17 @@ impl<F: NorFlash> Slots<F> {
         if sequence < self.floor {
             return Err(BeginError::BelowFloor { floor: self.floor, found: sequence });
         }
-        self.update = None;
+        Ok(())
+    }
+
+    /// Begins an update, for which the slot that does not run has to be [erased](Self::erase). An update
+    /// that was under way is dropped; a committed one that has not run yet, with the first sector.
+    ///
+    /// # Errors
+    /// [`BeginError`]; everything is as it was.
+    pub fn begin(&mut self, release: &Release) -> Result<(), BeginError> {
+        self.check(release)?;
+        let Release { length, sha256, sequence, robot } = *release;
         // Slots that cannot be read are empty.
         let [a, b] = Side::BOTH.map(|side| self.record(side).ok());
         let side = self.running.map_or_else(
@@ -823,23 +855,39 @@ impl<F: NorFlash> Slots<F> {
         );
         let generations = [a, b].into_iter().flatten().map(|record| record.header.generation);
         let generation = generations.max().unwrap_or(0).saturating_add(1);
-        // One by one, the header's first: no part of an old payload is gone while its header stands.
-        let end = self.at(side, self.geometry.slot_bytes);
-        let sector = u32::try_from(F::ERASE_SIZE).unwrap_or(u32::MAX);
-        let mut from = self.at(side, 0);
-        while from < end {
-            let to = from.saturating_add(sector);
-            self.flash.erase(from, to).map_err(BeginError::Flash)?;
-            from = to;
-        }
         self.update = Some(Update {
             side,
             header: Header { length, sequence, generation, robot, sha256 },
             written: 0,
             tail: [ERASED; CELL],
-            stage: Stage::Writing,
+            // One by one, the header's first: no part of an old payload is gone while its header stands.
+            stage: Stage::Erasing(self.at(side, 0)),
         });
         Ok(())
+    }
+
+    /// Erases the next sector for the update that has begun; the number that are still to be erased, 0 when
+    /// the payload can be written.
+    ///
+    /// # Errors
+    /// Those of the flash; the update has to begin again.
+    pub fn erase(&mut self) -> Result<u32, F::Error> {
+        let Some(Update { side, stage: Stage::Erasing(from), .. }) = self.update else {
+            return Ok(0);
+        };
+        let update = self.update.take();
+        let sector = u32::try_from(F::ERASE_SIZE).unwrap_or(u32::MAX);
+        let (to, end) = (from.saturating_add(sector), self.at(side, self.geometry.slot_bytes));
+        self.flash.erase(from, to)?;
+        let stage = if to < end { Stage::Erasing(to) } else { Stage::Writing };
+        self.update = update.map(|update| Update { stage, ..update });
+        Ok(end.saturating_sub(to).div_ceil(sector))
+    }
+
+    /// Sectors of a slot.
+    pub fn sectors(&self) -> u32 {
+        let sector = u32::try_from(F::ERASE_SIZE).unwrap_or(u32::MAX);
+        self.geometry.slot_bytes.checked_div(sector).unwrap_or(0)
     }
 
     /// Writes the next part of the payload, of any length. What does not fill a write unit waits for
@@ -900,14 +948,20 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`VerifyError`]; unless parts are missing the update has to begin again.
-    pub fn verify(&mut self) -> Result<(), VerifyError<F::Error>> {
+    pub fn verify(&mut self) -> Result<Payload, VerifyError<F::Error>> {
         let mut update = self.update.ok_or(VerifyError::NotWriting)?;
+        let Update { side, written, header, .. } = update;
+        let payload = Payload {
+            slot: side.into(),
+            offset: self.at(side, PAYLOAD_OFFSET),
+            length: header.length,
+            sequence: header.sequence,
+        };
         match update.stage {
             Stage::Writing => {}
-            Stage::Verified => return Ok(()),
-            Stage::Committed => return Err(VerifyError::NotWriting),
+            Stage::Verified => return Ok(payload),
+            Stage::Erasing(_) | Stage::Committed => return Err(VerifyError::NotWriting),
         }
-        let Update { side, written, header, .. } = update;
         if written != header.length {
             return Err(VerifyError::Incomplete { written, length: header.length });
         }
@@ -924,7 +978,7 @@ impl<F: NorFlash> Slots<F> {
         }
         update.stage = Stage::Verified;
         self.update = Some(update);
-        Ok(())
+        Ok(payload)
     }
 
     /// Writes header and commit mark: the next boot tries the model.
@@ -971,7 +1025,7 @@ impl<F: NorFlash> Slots<F> {
         let running = self.running.filter(|_| self.trial).ok_or(MarkError::NotReady)?;
         self.set(running.side, Mark::Confirmed, running.check)?;
         self.trial = false;
-        self.floor = self.floor.max(running.sequence);
+        self.floor = self.floor.max(running.header.sequence);
         Ok(())
     }
 

@@ -35,13 +35,14 @@ use crate::mcu::misuse::Misuse;
 use crate::mcu::uart::{self, UartEnd, UartSettings};
 use crate::mcu::{BrownOutDetector, Wire};
 use firmware_core::control_loop::telemetry::{Frame, Telemetry};
-use firmware_core::control_loop::{ControlLoopError, Mode};
+use firmware_core::control_loop::{ControlLoop as _, ControlLoopError, Mode};
 use firmware_core::link::Port;
 use firmware_core::model::{Model, Structure};
+use firmware_core::update::NoUpdates;
 use firmware_core::{blob, cost};
 use heapless::spsc::Queue;
 use host::{Alone, Host, Laptop};
-use rig::{Firmware, Rig};
+use rig::Rig;
 use scenario::{Controller, Scenario};
 use std::collections::VecDeque;
 use std::num::NonZeroU32;
@@ -358,7 +359,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             let Some(firmware) = firmware.as_mut() else { break };
 
             let began_us = clock.now_ns() / 1000;
-            port.receive(&mut serial, |command| firmware.command(command));
+            port.receive(&mut serial, firmware, &mut NoUpdates, began_us);
             let is_sample = of_boot % R::TICKS_PER_SAMPLE == 0;
             // While the model's history fills there is nothing to predict.
             let predicts = is_sample && of_boot / R::TICKS_PER_SAMPLE >= lag;
@@ -366,7 +367,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             let truth = rig.truth();
             firmware.tick(began_us);
             if is_sample {
-                let path: Vec<f32> = firmware.path().iter().flatten().copied().collect();
+                let path = firmware.path().to_vec();
                 if pending.len() == MOST_PENDING {
                     pending.pop_front();
                 }

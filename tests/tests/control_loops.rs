@@ -15,8 +15,8 @@ use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings
 use firmware_core::control_loop::telemetry::{Frames, Queue};
 use firmware_core::control_loop::tracker::Tracked;
 use firmware_core::control_loop::{
-    ActuatorError, Actuators, Alarms, Command, Frame, Measurement, Mode, Rosbot, SoftLeg,
-    Supervisor, Telemetry, Timing, Tracker,
+    ActuatorError, Actuators, Alarms, Command, ControlLoop, Frame, Measurement, Mode, Rosbot,
+    SoftLeg, Supervisor, Telemetry, Timing, Tracker,
 };
 use firmware_core::device::{EncoderCount, PositionSensor};
 use firmware_core::error_bounds::ErrorBounds;
@@ -336,56 +336,6 @@ impl<A: Actuators<2>> Actuators<2> for Checked<A> {
 
 // Loops
 
-/// What both loops can do.
-trait Loop {
-    fn command(&mut self, command: Command<2>);
-    fn tick(&mut self, now_us: u64) -> Mode;
-    fn finish(&mut self, now_us: u64) -> Mode;
-    fn mode(&self) -> Mode;
-    fn alarms(&self) -> Alarms;
-}
-
-impl<A: Actuators<2>, S: PositionSensor<2>, const H: usize> Loop for SoftLeg<'_, '_, '_, A, S, H> {
-    fn command(&mut self, command: Command<2>) {
-        self.command(command);
-    }
-    fn tick(&mut self, now_us: u64) -> Mode {
-        self.tick(now_us)
-    }
-    fn finish(&mut self, now_us: u64) -> Mode {
-        self.finish(now_us)
-    }
-    fn mode(&self) -> Mode {
-        self.mode()
-    }
-    fn alarms(&self) -> Alarms {
-        self.alarms()
-    }
-}
-
-impl<A, E, S, const H: usize> Loop for Rosbot<'_, '_, '_, A, E, S, H>
-where
-    A: Actuators<2>,
-    E: firmware_core::control_loop::rosbot::Encoders,
-    S: PositionSensor<3>,
-{
-    fn command(&mut self, command: Command<2>) {
-        self.command(command);
-    }
-    fn tick(&mut self, now_us: u64) -> Mode {
-        self.tick(now_us)
-    }
-    fn finish(&mut self, now_us: u64) -> Mode {
-        self.finish(now_us)
-    }
-    fn mode(&self) -> Mode {
-        self.mode()
-    }
-    fn alarms(&self) -> Alarms {
-        self.alarms()
-    }
-}
-
 /// Both loops, by the period of their ticks (µs).
 const LEG_US: u64 = 50_000;
 const ROSBOT_US: u64 = 10_000;
@@ -395,7 +345,7 @@ fn leg<T>(
     model: &Model<'static>,
     rig: &Rig,
     settings: SoftLegSettings,
-    test: impl FnOnce(&mut dyn Loop, &mut Frames<'_>) -> T,
+    test: impl FnOnce(&mut dyn ControlLoop<2>, &mut Frames<'_>) -> T,
 ) -> T {
     rig.0.borrow_mut().is_leg = true;
     let chamber = |i| Chamber::new(Duty(rig.clone(), i), Level(rig.clone(), i));
@@ -419,7 +369,7 @@ fn rosbot<T>(
     model: &Model<'static>,
     rig: &Rig,
     settings: RosbotSettings,
-    test: impl FnOnce(&mut dyn Loop, &mut Frames<'_>) -> T,
+    test: impl FnOnce(&mut dyn ControlLoop<2>, &mut Frames<'_>) -> T,
 ) -> T {
     rig.0.borrow_mut().is_leg = false;
     let motor = |i| Motor::new(Duty(rig.clone(), i), Level(rig.clone(), i));
@@ -434,7 +384,7 @@ fn rosbot<T>(
 }
 
 /// Ticks a loop every period from `*now_us` on.
-fn run(robot: &mut dyn Loop, now_us: &mut u64, period_us: u64, ticks: usize) {
+fn run(robot: &mut dyn ControlLoop<2>, now_us: &mut u64, period_us: u64, ticks: usize) {
     for _ in 0..ticks {
         robot.tick(*now_us);
         robot.finish(*now_us + period_us / 3);
@@ -528,7 +478,7 @@ fn check_off(rig: &Rig, mode: Mode) -> Result<(), TestCaseError> {
 }
 
 fn whatever_happens(
-    robot: &mut dyn Loop,
+    robot: &mut dyn ControlLoop<2>,
     frames: &mut Frames<'_>,
     rig: &Rig,
     period_us: u64,
@@ -629,7 +579,7 @@ fn no_sequence_of_events_leaves_an_actuator_on() {
 
 /// Drives a loop back and forth with a device that breaks; what became of the tick in which it did.
 fn with_broken(
-    robot: &mut dyn Loop,
+    robot: &mut dyn ControlLoop<2>,
     frames: &mut Frames<'_>,
     rig: &Rig,
     period_us: u64,
@@ -735,7 +685,10 @@ fn a_sensor_or_encoder_may_fail_now_and_then_but_not_on_and_on() {
 // The state machine
 
 /// A leg in a mode, at the time of its next tick.
-fn leg_in<T>(mode: Mode, test: impl FnOnce(&mut dyn Loop, &mut Frames<'_>, &Rig, u64) -> T) -> T {
+fn leg_in<T>(
+    mode: Mode,
+    test: impl FnOnce(&mut dyn ControlLoop<2>, &mut Frames<'_>, &Rig, u64) -> T,
+) -> T {
     let rig = Rig::new(true);
     leg(&PLAIN_BOUNDED, &rig.clone(), SoftLegSettings::default(), |robot, frames| {
         let mut now_us = 0;
@@ -890,11 +843,11 @@ fn a_silent_host_stops_the_robot_by_time_or_by_ticks() {
 fn a_start_without_a_measurement_is_refused() {
     for is_leg in [true, false] {
         let rig = Rig::new(is_leg);
-        let test = |robot: &mut dyn Loop, _: &mut Frames<'_>| {
+        let test = |robot: &mut dyn ControlLoop<2>, _: &mut Frames<'_>| {
             let period_us = if is_leg { LEG_US } else { ROSBOT_US };
             let sample = if is_leg { 1 } else { 10 };
             let mut now_us = 0;
-            let mut start = |robot: &mut dyn Loop, measured| {
+            let mut start = |robot: &mut dyn ControlLoop<2>, measured| {
                 rig.measures(measured);
                 run(robot, &mut now_us, period_us, sample);
                 robot.command(Command::Start);
@@ -1177,7 +1130,7 @@ fn a_robot_at_rest_is_only_asked_for_its_sensor() {
 
 /// Ticks of a ROSbot whose wheels turn by so many counts a tick; its frames.
 fn drive(
-    robot: &mut dyn Loop,
+    robot: &mut dyn ControlLoop<2>,
     frames: &mut Frames<'_>,
     rig: &Rig,
     now_us: &mut u64,

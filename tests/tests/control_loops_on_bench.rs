@@ -9,7 +9,7 @@ use firmware_core::blob::Aligned;
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
 use firmware_core::control_loop::telemetry::Queue;
-use firmware_core::control_loop::{Command, Frame, Mode, Rosbot, SoftLeg, Telemetry};
+use firmware_core::control_loop::{Command, ControlLoop, Frame, Mode, Rosbot, SoftLeg, Telemetry};
 use firmware_core::device::{MonotonicClock, PositionSensor};
 use firmware_core::error_bounds::ErrorBounds;
 use firmware_core::model::Space;

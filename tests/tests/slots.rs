@@ -403,11 +403,12 @@ impl<const WRITE: usize, const ERASE: usize> Lab<WRITE, ERASE> {
     ) -> Result<(), String> {
         let release = Release::new(&self.models.robot, sequence, model).unwrap();
         slots.begin(&release).map_err(|error| format!("begin: {error:?}"))?;
+        while slots.erase().map_err(|error| format!("erase: {error:?}"))? > 0 {}
         for (i, part) in model.chunks(PART).enumerate() {
             let written = slots.write((i * PART) as u32, part);
             written.map_err(|error| format!("write: {error:?}"))?;
         }
-        slots.verify().map_err(|error| format!("verify: {error:?}"))
+        slots.verify().map(|_| ()).map_err(|error| format!("verify: {error:?}"))
     }
 
     /// All of an update but the trial.
@@ -1015,7 +1016,7 @@ fn what_is_below_the_floor_neither_comes_nor_stays() {
     assert_eq!(boot.refused, [Some(below), Some(Refusal::Payload)]);
     // An update spares the slot with the floor, however often it is begun.
     for _ in 0..2 {
-        slots.begin(&release(OLD)).unwrap();
+        begin(&mut slots, &release(OLD));
         assert_eq!(lab.flash.snapshot()[0x4000..], image[0x4000..]);
     }
     lab.update(&mut slots, &models.new, OLD);
@@ -1062,7 +1063,7 @@ fn an_update_that_is_aborted_or_damaged_does_not_run() {
     let release = Release::new(&models.robot, NEW, &models.new).unwrap();
     // Before the commit, and after it.
     let (mut slots, _) = lab.boot();
-    slots.begin(&release).unwrap();
+    begin(&mut slots, &release);
     slots.write(0, &models.new[..10]).unwrap();
     slots.abort().unwrap();
     assert_eq!(slots.written(), None);
@@ -1077,7 +1078,7 @@ fn an_update_that_is_aborted_or_damaged_does_not_run() {
     // Bytes that got lost on the way.
     let mut damaged = models.new.clone();
     damaged[500] ^= 4;
-    slots.begin(&release).unwrap();
+    begin(&mut slots, &release);
     slots.write(0, &damaged).unwrap();
     assert_eq!(slots.verify(), Err(VerifyError::Hash));
     assert_eq!(slots.commit(), Err(MarkError::NotReady));
@@ -1093,7 +1094,7 @@ fn parts_come_in_order_and_a_broken_line_is_taken_up_again() {
     let (mut slots, _) = lab.boot();
     assert_eq!(slots.commit(), Err(MarkError::NotReady));
     let release = Release::new(&models.robot, NEW, &models.new).unwrap();
-    slots.begin(&release).unwrap();
+    begin(&mut slots, &release);
     assert_eq!(slots.written(), Some(0));
     slots.write(0, &models.new[..101]).unwrap();
     // The acknowledgement was lost.
@@ -1115,6 +1116,17 @@ fn parts_come_in_order_and_a_broken_line_is_taken_up_again() {
     let (_, boot) = lab.boot();
     assert_eq!(lab.payload(boot.payload.unwrap()).unwrap(), models.new);
     lab.no_misuse();
+}
+
+/// Begins an update, and erases.
+fn begin<F: NorFlash<Error: std::fmt::Debug>>(slots: &mut Slots<F>, release: &Release) {
+    slots.begin(release).unwrap();
+    assert_eq!((slots.update(), slots.written()), (Some(*release), None));
+    assert_eq!(slots.write(0, &[1]).map_err(|_| ()), Err(()), "nothing before it is erased");
+    for left in (0..slots.sectors()).rev() {
+        assert_eq!(slots.erase().unwrap(), left);
+    }
+    assert_eq!((slots.erase().unwrap(), slots.written()), (0, Some(0)));
 }
 
 /// A flash in memory that knows no other write unit, and writes each only once.
@@ -1178,7 +1190,7 @@ fn install<const W: usize, const R: usize>(payload: &[u8], parts: &[usize]) -> V
         Slots::boot(memory, geometry, "robot", 0, |_| true).unwrap()
     }
     let (mut slots, _) = boot(&mut memory);
-    slots.begin(&Release::new("robot", 1, payload).unwrap()).unwrap();
+    begin(&mut slots, &Release::new("robot", 1, payload).unwrap());
     let mut parts = parts.iter().cycle();
     let mut rest = payload;
     while !rest.is_empty() {
@@ -1228,7 +1240,7 @@ proptest! {
         let (mut slots, boot) = Slots::boot(&mut memory, geometry, "robot", 0, |_| true).unwrap();
         prop_assert_eq!(boot.running, Which::Factory);
         prop_assert_eq!(boot.floor, 0);
-        slots.begin(&Release::new("robot", 0, b"model").unwrap()).unwrap();
+        begin(&mut slots, &Release::new("robot", 0, b"model").unwrap());
         slots.write(0, b"model").unwrap();
         slots.verify().unwrap();
         slots.commit().unwrap();

@@ -211,8 +211,8 @@ pub fn listen(
                     next = Some(frame.sequence.wrapping_add(1));
                     watch(&frame)?;
                 }
-                Received::Message(_) => {}
-                Received::Damaged => heard.damaged += u64::from(!was_first),
+                Received::Message(_) | Received::Unknown { .. } => {}
+                Received::Damaged | Received::TooLong => heard.damaged += u64::from(!was_first),
             }
         }
     }

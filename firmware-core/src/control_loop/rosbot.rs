@@ -20,7 +20,9 @@ use embedded_hal::pwm::SetDutyCycle;
 use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
 use crate::control_loop::telemetry::{Frame, Telemetry};
 use crate::control_loop::tracker::Tracker;
-use crate::control_loop::{ActuatorError, Actuators, Command, ControlLoopError, set_share};
+use crate::control_loop::{
+    ActuatorError, Actuators, Command, ControlLoop, ControlLoopError, set_share,
+};
 use crate::device::{EncoderCount, PositionSensor};
 use crate::model::Model;
 
@@ -264,70 +266,6 @@ where
         })
     }
 
-    /// What the host asks for.
-    pub fn command(&mut self, command: Command<2>) {
-        self.supervisor.follow(command, &mut self.wanted, &self.tracker);
-        if self.supervisor.mode() != Mode::Running {
-            // Also when a start follows before the next tick.
-            self.forget();
-        }
-    }
-
-    /// One tick: counts, controls the wheels' speeds, and at a sample measures, predicts and reports.
-    pub fn tick(&mut self, now_us: u64) -> Mode {
-        self.supervisor.begin(now_us);
-        self.count();
-        // The first tick is a sample, and every `ticks_per_sample`th from there on.
-        let frame = (self.ticks == 0 || self.ticks >= self.settings.ticks_per_sample)
-            .then(|| self.sample(now_us));
-
-        let mut shares = [0.0; 2];
-        if self.supervisor.mode() == Mode::Running {
-            for ((share, side), command) in shares.iter_mut().zip(&mut self.sides).zip(self.wanted)
-            {
-                let volt = side.control(command, &self.settings, self.period_s);
-                *share = volt / self.settings.supply_volt;
-            }
-            if self.sides.iter().any(|side| side.stalled_s > STALL_S) {
-                self.supervisor.raise(Alarms::ENCODER);
-            }
-        } else {
-            self.forget();
-        }
-        let mode = self.supervisor.act(&mut self.actuators, shares);
-        let applied = if mode == Mode::Running { self.wanted } else { [0.0; 2] };
-        for ((sum, side), command) in self.sum.iter_mut().zip(&mut self.sides).zip(applied) {
-            *sum += command;
-            side.deviation += side.speed - command;
-        }
-        self.ticks = self.ticks.saturating_add(1);
-        if let Some(frame) = frame {
-            self.telemetry.send(self.supervisor.report(frame));
-        }
-        mode
-    }
-
-    /// The tick is over: was it in time? If not, or after a stop during the tick, the motors go off at
-    /// once.
-    pub fn finish(&mut self, now_us: u64) -> Mode {
-        self.supervisor.finish(now_us, &mut self.actuators)
-    }
-
-    /// Where the robot will be at the coming samples (model's units).
-    pub fn path(&self) -> &[[f32; 3]] {
-        self.tracker.path()
-    }
-
-    /// What the loop may do.
-    pub fn mode(&self) -> Mode {
-        self.supervisor.mode()
-    }
-
-    /// What was noticed since the last start or reset.
-    pub fn alarms(&self) -> Alarms {
-        self.supervisor.alarms()
-    }
-
     /// The devices, to look at.
     pub fn devices(&self) -> (&A, &E, &S) {
         (&self.actuators, &self.encoders, &self.sensor)
@@ -397,5 +335,70 @@ where
             side.mean_deviation = 0.0;
             side.stalled_s = 0.0;
         }
+    }
+}
+
+impl<A, E, S, const H: usize> ControlLoop<2> for Rosbot<'_, '_, '_, A, E, S, H>
+where
+    A: Actuators<2>,
+    E: Encoders,
+    S: PositionSensor<3>,
+{
+    fn command(&mut self, command: Command<2>) {
+        self.supervisor.follow(command, &mut self.wanted, &self.tracker);
+        if self.supervisor.mode() != Mode::Running {
+            // Also when a start follows before the next tick.
+            self.forget();
+        }
+    }
+
+    /// One tick: counts, controls the wheels' speeds, and at a sample measures, predicts and reports.
+    fn tick(&mut self, now_us: u64) -> Mode {
+        self.supervisor.begin(now_us);
+        self.count();
+        // The first tick is a sample, and every `ticks_per_sample`th from there on.
+        let frame = (self.ticks == 0 || self.ticks >= self.settings.ticks_per_sample)
+            .then(|| self.sample(now_us));
+
+        let mut shares = [0.0; 2];
+        if self.supervisor.mode() == Mode::Running {
+            for ((share, side), command) in shares.iter_mut().zip(&mut self.sides).zip(self.wanted)
+            {
+                let volt = side.control(command, &self.settings, self.period_s);
+                *share = volt / self.settings.supply_volt;
+            }
+            if self.sides.iter().any(|side| side.stalled_s > STALL_S) {
+                self.supervisor.raise(Alarms::ENCODER);
+            }
+        } else {
+            self.forget();
+        }
+        let mode = self.supervisor.act(&mut self.actuators, shares);
+        let applied = if mode == Mode::Running { self.wanted } else { [0.0; 2] };
+        for ((sum, side), command) in self.sum.iter_mut().zip(&mut self.sides).zip(applied) {
+            *sum += command;
+            side.deviation += side.speed - command;
+        }
+        self.ticks = self.ticks.saturating_add(1);
+        if let Some(frame) = frame {
+            self.telemetry.send(self.supervisor.report(frame));
+        }
+        mode
+    }
+
+    fn finish(&mut self, now_us: u64) -> Mode {
+        self.supervisor.finish(now_us, &mut self.actuators)
+    }
+
+    fn path(&self) -> &[f32] {
+        self.tracker.path().as_flattened()
+    }
+
+    fn supervisor(&self) -> &Supervisor {
+        &self.supervisor
+    }
+
+    fn supervisor_mut(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
     }
 }

@@ -8,10 +8,12 @@
 use embedded_hal::digital::OutputPin;
 use embedded_hal::pwm::SetDutyCycle;
 
-use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
+use crate::control_loop::supervisor::{Mode, Supervisor, Timing};
 use crate::control_loop::telemetry::{Frame, Telemetry};
 use crate::control_loop::tracker::Tracker;
-use crate::control_loop::{ActuatorError, Actuators, Command, ControlLoopError, set_share};
+use crate::control_loop::{
+    ActuatorError, Actuators, Command, ControlLoop, ControlLoopError, set_share,
+};
 use crate::device::PositionSensor;
 use crate::model::Model;
 
@@ -152,8 +154,18 @@ where
         })
     }
 
-    /// What the host asks for.
-    pub fn command(&mut self, command: Command<2>) {
+    /// The devices, to look at.
+    pub fn devices(&self) -> (&A, &S) {
+        (&self.actuators, &self.sensor)
+    }
+}
+
+impl<A, S, const H: usize> ControlLoop<2> for SoftLeg<'_, '_, '_, A, S, H>
+where
+    A: Actuators<2>,
+    S: PositionSensor<2>,
+{
+    fn command(&mut self, command: Command<2>) {
         self.supervisor.follow(command, &mut self.wanted, &self.tracker);
         // A model may have been trained with a larger supply: what is predicted and reported is what acts.
         let most = self.settings.supply_volt;
@@ -161,7 +173,7 @@ where
     }
 
     /// One tick: measures, predicts, acts, reports.
-    pub fn tick(&mut self, now_us: u64) -> Mode {
+    fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
         let measured = self.tracker.measure(&mut self.sensor);
         let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
@@ -175,9 +187,7 @@ where
         mode
     }
 
-    /// The tick is over: was it in time? If not, or after a stop during the tick, the actuators go off at
-    /// once.
-    pub fn finish(&mut self, now_us: u64) -> Mode {
+    fn finish(&mut self, now_us: u64) -> Mode {
         let mode = self.supervisor.finish(now_us, &mut self.actuators);
         if mode != Mode::Running {
             self.applied = [0.0; 2];
@@ -185,23 +195,15 @@ where
         mode
     }
 
-    /// Where the tip will be at the coming samples (model's units).
-    pub fn path(&self) -> &[[f32; 2]] {
-        self.tracker.path()
+    fn path(&self) -> &[f32] {
+        self.tracker.path().as_flattened()
     }
 
-    /// What the loop may do.
-    pub fn mode(&self) -> Mode {
-        self.supervisor.mode()
+    fn supervisor(&self) -> &Supervisor {
+        &self.supervisor
     }
 
-    /// What was noticed since the last start or reset.
-    pub fn alarms(&self) -> Alarms {
-        self.supervisor.alarms()
-    }
-
-    /// The devices, to look at.
-    pub fn devices(&self) -> (&A, &S) {
-        (&self.actuators, &self.sensor)
+    fn supervisor_mut(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
     }
 }

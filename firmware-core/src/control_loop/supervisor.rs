@@ -7,6 +7,9 @@
 //!    └────────── Stop ───────────┘                                        │
 //!    └────────────────────────────── Reset ───────────────────────────────┘
 //! ```
+//!
+//! While a model is installed ([`hold`](Supervisor::hold)) a robot that was not running is in Safe, and
+//! stays there.
 
 use core::fmt;
 
@@ -72,6 +75,8 @@ impl Alarms {
     pub const OUT_OF_RANGE: Self = Self(1 << 12);
     /// A measurement was too old to belong to its sample, and was not used.
     pub const SENSOR_LATE: Self = Self(1 << 13);
+    /// A new model is being installed: the robot is held in Safe.
+    pub const UPDATE: Self = Self(1 << 14);
 
     /// Those with which a robot does not go on.
     pub const SAFE: Self = Self(
@@ -92,7 +97,7 @@ impl Alarms {
     /// Those that tell of a fault: not that the model was asked beyond its training.
     pub const TELLING: Self = Self(!Self::OUT_OF_RANGE.0);
 
-    const NAMES: [(Self, &'static str); 14] = [
+    const NAMES: [(Self, &'static str); 15] = [
         (Self::HOST_SILENT, "host silent"),
         (Self::LATE, "late"),
         (Self::CLOCK, "clock"),
@@ -107,6 +112,7 @@ impl Alarms {
         (Self::BAD_COMMAND, "bad command"),
         (Self::OUT_OF_RANGE, "out of range"),
         (Self::SENSOR_LATE, "sensor late"),
+        (Self::UPDATE, "update"),
     ];
 
     /// None.
@@ -240,6 +246,8 @@ pub struct Supervisor {
     /// Ticks since then: they count on when the clock does not.
     silent_ticks: u32,
     worst_us: u32,
+    /// Nothing leads out of Safe.
+    held: bool,
 }
 
 impl Supervisor {
@@ -254,6 +262,7 @@ impl Supervisor {
             heard_us: 0,
             silent_ticks: 0,
             worst_us: 0,
+            held: false,
         }
     }
 
@@ -417,9 +426,28 @@ impl Supervisor {
 
     /// Safe → Idle.
     pub fn reset(&mut self) {
-        if self.mode == Mode::Safe {
+        if self.mode == Mode::Safe && !self.held {
             self.mode = Mode::Idle;
             self.alarms = Alarms::none();
+        }
+    }
+
+    /// Holds a robot that is not running in Safe, with [`Alarms::UPDATE`], from where no reset leads out
+    /// until it is no longer held. A running robot is not held.
+    pub fn hold(&mut self, held: bool) {
+        self.held = held && self.mode != Mode::Running;
+        if self.held {
+            self.mode = Mode::Safe;
+            if !self.alarms.contains(Alarms::UPDATE) {
+                self.raise(Alarms::UPDATE);
+            }
+        }
+    }
+
+    /// A robot that is not running was kept waiting on purpose: its next tick comes late without being so.
+    pub fn pause(&mut self) {
+        if self.mode != Mode::Running {
+            self.began_us = None;
         }
     }
 

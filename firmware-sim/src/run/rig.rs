@@ -10,19 +10,8 @@ use crate::soft_leg::SoftLegParameters;
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
 use firmware_core::control_loop::telemetry::Telemetry;
-use firmware_core::control_loop::{
-    Actuators, Command, ControlLoopError, Mode, Rosbot, SoftLeg, rosbot::Encoders,
-};
-use firmware_core::device::PositionSensor;
+use firmware_core::control_loop::{ControlLoop, ControlLoopError, Rosbot, SoftLeg};
 use firmware_core::model::Model;
-
-/// The loop of a robot with `N` coordinates and two inputs.
-pub(crate) trait Firmware<const N: usize> {
-    fn command(&mut self, command: Command<2>);
-    fn tick(&mut self, now_us: u64) -> Mode;
-    fn finish(&mut self, now_us: u64) -> Mode;
-    fn path(&self) -> &[[f32; N]];
-}
 
 /// A robot and its microcontroller, without the firmware.
 pub(crate) trait Rig<const N: usize> {
@@ -45,7 +34,7 @@ pub(crate) trait Rig<const N: usize> {
         faults: &Faults,
         seed: u64,
         telemetry: Telemetry<'q>,
-    ) -> Result<impl Firmware<N> + use<'m, 'q, Self, N>, ControlLoopError>;
+    ) -> Result<impl ControlLoop<2> + use<'m, 'q, Self, N>, ControlLoopError>;
     fn apply(&mut self, faults: &Faults);
     fn advance_us(&mut self, us: u64);
     fn board(&mut self) -> &mut Board;
@@ -54,45 +43,6 @@ pub(crate) trait Rig<const N: usize> {
     fn truth(&self) -> [f64; N];
     /// Whether nothing is driven.
     fn is_off(&self) -> bool;
-}
-
-impl<A, E, S, const H: usize> Firmware<3> for Rosbot<'_, '_, '_, A, E, S, H>
-where
-    A: Actuators<2>,
-    E: Encoders,
-    S: PositionSensor<3>,
-{
-    fn command(&mut self, command: Command<2>) {
-        self.command(command);
-    }
-    fn tick(&mut self, now_us: u64) -> Mode {
-        self.tick(now_us)
-    }
-    fn finish(&mut self, now_us: u64) -> Mode {
-        self.finish(now_us)
-    }
-    fn path(&self) -> &[[f32; 3]] {
-        self.path()
-    }
-}
-
-impl<A, S, const H: usize> Firmware<2> for SoftLeg<'_, '_, '_, A, S, H>
-where
-    A: Actuators<2>,
-    S: PositionSensor<2>,
-{
-    fn command(&mut self, command: Command<2>) {
-        self.command(command);
-    }
-    fn tick(&mut self, now_us: u64) -> Mode {
-        self.tick(now_us)
-    }
-    fn finish(&mut self, now_us: u64) -> Mode {
-        self.finish(now_us)
-    }
-    fn path(&self) -> &[[f32; 2]] {
-        self.path()
-    }
 }
 
 impl Rig<3> for RosbotBench {
@@ -113,7 +63,7 @@ impl Rig<3> for RosbotBench {
         faults: &Faults,
         seed: u64,
         telemetry: Telemetry<'q>,
-    ) -> Result<impl Firmware<3> + use<'m, 'q>, ControlLoopError> {
+    ) -> Result<impl ControlLoop<2> + use<'m, 'q>, ControlLoopError> {
         let devices = self.devices(MotionCaptureSettings::POSE, seed);
         let devices = devices.expect("a reset frees all devices");
         let [pwm_right, pwm_left] = devices.pwm;
@@ -167,7 +117,7 @@ impl Rig<2> for SoftLegBench {
         faults: &Faults,
         seed: u64,
         telemetry: Telemetry<'q>,
-    ) -> Result<impl Firmware<2> + use<'m, 'q>, ControlLoopError> {
+    ) -> Result<impl ControlLoop<2> + use<'m, 'q>, ControlLoopError> {
         let devices = self.devices(MotionCaptureSettings::TIP, seed);
         let devices = devices.expect("a reset frees all devices");
         let [bending, extension] = devices.valves;

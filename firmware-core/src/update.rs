@@ -1,0 +1,964 @@
+//! Installing a new model over the line: who may, when, and step by step.
+//!
+//! ```text
+//! host                                 controller
+//!  Hello ────────────────────────────►
+//!        ◄──────────────────────────── Hello: who it is, what runs, what it has room for
+//!  Begin: session, release, signature ►          signature checked, the robot held in Safe
+//!        ◄──────────────────────────── Working: most milliseconds until the next answer
+//!        ◄──────────────────────────── Begun: bytes that are there already    (slot erased)
+//!  Chunk: session, offset, bytes ─────►
+//!        ◄──────────────────────────── Written: bytes that are there     (after it is written)
+//!  Verify: session ───────────────────►          read back, hashed, parsed, self-test
+//!        ◄──────────────────────────── Verified
+//!  Activate: session, signature ──────►          committed
+//!        ◄──────────────────────────── Activated                   … and the controller resets
+//!  Hello ────────────────────────────►
+//!        ◄──────────────────────────── Hello: the new model runs on trial, so many good ticks
+//!  Confirm: signature ────────────────►          after enough of them
+//!        ◄──────────────────────────── Confirmed
+//! ```
+//!
+//! The bytes on the line are specified in docs/protocol.md. Every request gets one answer with its number,
+//! `Begin` two when it has to erase; a request that is not understood, or may not be, gets
+//! [`Say::Refused`]. All requests may be repeated when an answer does not come.
+//!
+//! # When
+//!
+//! While the robot runs every request but `Hello` is answered [`Refused::Busy`], without looking at its
+//! signature. At rest, `Begin` with a right signature holds the robot in Safe until the update is aborted,
+//! or nothing has been heard of it for [`SILENCE_US`]. Nothing else here changes what the robot does.
+//!
+//! # Who
+//!
+//! Whoever has a file that was signed: the controller knows a public key and no secret. Four statements
+//! are signed (Ed25519, RFC 8032), one for each thing that may be done with a release, so that whoever
+//! hears one of them on the line cannot do the next: [`statement`]. What is signed is the hash of the
+//! blob, which is compared with what was written before it may be activated, its length, the robot and the
+//! sequence number. A wrong signature makes the next check wait for [`SIGNATURE_PAUSE_US`]: checking takes
+//! some 1.7 million instructions, and nobody shall keep a controller busy with it.
+//!
+//! A session is a number that the host draws: chunks of an update that is not that of the session are
+//! refused, and while a session is alive no other begins.
+
+use embedded_storage::nor_flash::NorFlash;
+use heapless::{String, Vec};
+use serde::{Deserialize, Serialize};
+
+use crate::capacity::{
+    MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_SPARSE_TERMS, MAX_STATES,
+    MAX_TERMS,
+};
+use crate::control_loop::{Alarms, Mode};
+use crate::cost;
+use crate::model::Model;
+use crate::slots::{
+    BeginError, Boot, Geometry, GeometryError, MarkError, Payload, Release, Slots, VerifyError,
+    Which, WriteError, robot, sha256,
+};
+
+/// The version of the protocol.
+pub const PROTOCOL: u8 = 1;
+/// Most bytes of a blob in one message.
+pub const MAX_CHUNK: usize = 192;
+/// A session that says nothing for so long is over (µs); what it wrote can be gone on with.
+pub const SILENCE_US: u64 = 5_000_000;
+/// Time from a wrong signature to the next check of one (µs).
+pub const SIGNATURE_PAUSE_US: u64 = 1_000_000;
+/// Bytes of a signature.
+pub const SIGNATURE: usize = 64;
+
+/// A signature; empty where nothing is signed.
+pub type Signature = Vec<u8, SIGNATURE>;
+
+/// What the host asks for.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Request {
+    /// Comes back with the answer. A repeated request keeps its number.
+    pub number: u8,
+    /// What.
+    pub ask: Ask,
+}
+
+/// The kinds of requests.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+// There is no heap to put a chunk on.
+#[allow(clippy::large_enum_variant)]
+pub enum Ask {
+    /// Who are you? Answered with [`Say::Hello`], always.
+    Hello,
+    /// Begins an update, or goes on with one of the same release.
+    Begin {
+        /// Number of the session, drawn by the host.
+        session: u32,
+        /// What is to be installed.
+        release: Release,
+        /// Of [`Purpose::Install`].
+        signature: Signature,
+    },
+    /// Bytes of the blob.
+    Chunk {
+        /// Number of the session.
+        session: u32,
+        /// Where they belong.
+        offset: u32,
+        /// The bytes.
+        bytes: Vec<u8, MAX_CHUNK>,
+    },
+    /// All bytes are there: are they right, and a model that this robot can run?
+    Verify {
+        /// Number of the session.
+        session: u32,
+    },
+    /// Commits what has been verified, and resets the controller.
+    Activate {
+        /// Number of the session.
+        session: u32,
+        /// Of [`Purpose::Activate`].
+        signature: Signature,
+    },
+    /// Keeps the model that is on trial.
+    Confirm {
+        /// Of [`Purpose::Confirm`].
+        signature: Signature,
+    },
+    /// Drops the update.
+    Abort {
+        /// Number of the session.
+        session: u32,
+        /// Of [`Purpose::Abort`].
+        signature: Signature,
+    },
+}
+
+/// What the controller answers.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Answer {
+    /// Number of the request; 0 when it could not be read.
+    pub number: u8,
+    /// What.
+    pub say: Say,
+}
+
+/// The kinds of answers.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant)]
+pub enum Say {
+    /// Who it is.
+    Hello(Hello),
+    /// Another answer follows.
+    Working {
+        /// Most time until then (ms).
+        most_ms: u32,
+    },
+    /// The slot is ready.
+    Begun {
+        /// Bytes of the blob that are there already.
+        written: u32,
+    },
+    /// A chunk is in the flash.
+    Written {
+        /// Bytes of the blob that are there.
+        written: u32,
+    },
+    /// The blob is right, and can be run.
+    Verified,
+    /// Committed; the controller resets.
+    Activated,
+    /// The model boots from now on.
+    Confirmed,
+    /// The update is dropped.
+    Aborted,
+    /// No, and why.
+    Refused(Refused),
+}
+
+/// Why the controller does not do it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub enum Refused {
+    /// The message is not known here: another version of the protocol, or a controller that takes no
+    /// updates.
+    Unknown {
+        /// Its first byte.
+        variant: u8,
+    },
+    /// The frame is longer than there is room for.
+    TooLong {
+        /// Bytes of the longest frame, its final zero included.
+        most: u32,
+    },
+    /// The robot is running.
+    Busy,
+    /// Another request is being worked on.
+    Working,
+    /// The release is not signed, or not with the key that is trusted here.
+    Signature,
+    /// There was a wrong signature a moment ago.
+    Pause {
+        /// Time until the next one is looked at (ms).
+        ms: u32,
+    },
+    /// The model is one of another robot.
+    AnotherRobot {
+        /// [`robot`] of the name of this one.
+        robot: u32,
+    },
+    /// The release is older than what has been confirmed.
+    BelowFloor {
+        /// Lowest sequence number that is accepted.
+        floor: u32,
+    },
+    /// The blob is empty, or longer than a slot.
+    Length {
+        /// Bytes there is room for.
+        room: u32,
+    },
+    /// The model that runs is on trial: confirm it, or restart the controller, which drops it.
+    OnTrial,
+    /// Another session is alive.
+    InUse,
+    /// There is no such session: begin.
+    NoSession,
+    /// The chunk does not begin where the one before it ended, or it ends beyond the blob.
+    OutOfOrder {
+        /// Bytes of the blob that are there.
+        written: u32,
+    },
+    /// The blob is not complete.
+    Incomplete {
+        /// Bytes of the blob that are there.
+        written: u32,
+    },
+    /// What was written is not what was signed; the update is dropped.
+    Hash,
+    /// The blob is no model, fails its self-test, or is one that this robot cannot run; the update is
+    /// dropped.
+    Model,
+    /// Nothing has been verified.
+    NotVerified,
+    /// No model is on trial.
+    NotOnTrial,
+    /// The model on trial has not had enough good ticks in a row.
+    TooEarly {
+        /// Those it has had.
+        good: u32,
+        /// Those it needs.
+        needed: u32,
+    },
+    /// The flash failed; the update is dropped.
+    Flash,
+}
+
+/// Who a controller is.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Hello {
+    /// [`PROTOCOL`].
+    pub protocol: u8,
+    /// Its firmware and version.
+    pub firmware: String<24>,
+    /// Beginning of the robot's name, as far as there is room.
+    pub name: String<24>,
+    /// [`robot`] of the whole name.
+    pub robot: u32,
+    /// What the loop is doing.
+    pub mode: Mode,
+    /// What it has room for.
+    pub capacities: Capacities,
+    /// Which model runs.
+    pub which: Which,
+    /// The release that brought it; of the factory model length and hash, and sequence number 0.
+    pub release: Release,
+    /// Whether it is still to be confirmed.
+    pub trial: Option<Trial>,
+    /// Lowest sequence number that is accepted.
+    pub floor: u32,
+    /// The first bytes of the public key that is trusted; `None`: everybody is.
+    pub key: Option<[u8; 8]>,
+}
+
+/// How a trial goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Trial {
+    /// Good ticks in a row.
+    pub good: u32,
+    /// Good ticks in a row before it can be confirmed.
+    pub needed: u32,
+}
+
+/// What a controller and its loop have room for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Capacities {
+    /// Sample time of the loop (µs).
+    pub sample_us: u32,
+    /// State coordinates of the loop.
+    pub states: u8,
+    /// Inputs of the loop.
+    pub inputs: u8,
+    /// Bytes of a blob.
+    pub room: u32,
+    /// Most instructions of one step; 0 where that is not known.
+    pub instructions: u32,
+    /// [`MAX_LAG`].
+    pub lag: u8,
+    /// [`MAX_OBSERVABLES`].
+    pub observables: u16,
+    /// [`MAX_BLOCKS`].
+    pub blocks: u16,
+    /// [`MAX_FACTORS`].
+    pub factors: u16,
+    /// [`MAX_TERMS`].
+    pub terms: u16,
+    /// [`MAX_SPARSE_TERMS`].
+    pub sparse_terms: u16,
+}
+
+/// Why a model cannot run on a controller.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Misfit {
+    /// Of what there is too much, or another number.
+    pub field: &'static str,
+    /// What the controller has.
+    pub expected: u64,
+    /// What the model has.
+    pub found: u64,
+}
+
+impl Capacities {
+    /// Those of this build, for a loop of `N` coordinates and `M` inputs with a sample time in µs.
+    /// `instructions` is what one step of its model may take at most, 0 if that does not matter.
+    pub const fn new<const N: usize, const M: usize>(sample_us: u32, instructions: u32) -> Self {
+        const { assert!(N <= MAX_STATES && M <= MAX_INPUTS) };
+        Self {
+            sample_us,
+            states: N as u8,
+            inputs: M as u8,
+            // The slots know.
+            room: 0,
+            instructions,
+            lag: MAX_LAG as u8,
+            observables: MAX_OBSERVABLES as u16,
+            blocks: MAX_BLOCKS as u16,
+            factors: MAX_FACTORS as u16,
+            terms: MAX_TERMS as u16,
+            sparse_terms: MAX_SPARSE_TERMS as u16,
+        }
+    }
+
+    /// Whether a model of `length` bytes fits: on the laptop, before anything is sent, and on the
+    /// controller, before it is activated. What is not among these numbers its parser refuses.
+    ///
+    /// # Errors
+    /// [`Misfit`], the first one.
+    pub fn check(&self, model: &Model<'_>, length: usize) -> Result<(), Misfit> {
+        let structure = model.structure();
+        let sample_us = libm::roundf(structure.sample_time_s() * 1e6) as u32;
+        let dictionary = structure.dictionary();
+        let sparse = model.terms();
+        let exact = [
+            ("sample time in µs", self.sample_us, sample_us),
+            ("states", self.states.into(), count(structure.states().len())),
+            ("inputs", self.inputs.into(), count(structure.inputs().len())),
+        ];
+        let (dense_terms, sparse_terms) =
+            sparse.map_or_else(|| (dictionary.dense_terms(), 0), |terms| (0, terms.count()));
+        let unlimited = |limit: u32| if limit == 0 { u32::MAX } else { limit };
+        let factors = dictionary.blocks().map(|(_, factors)| factors.len()).sum();
+        let most = [
+            ("bytes", self.room, count(length)),
+            (
+                "instructions of a step",
+                unlimited(self.instructions),
+                cost::instructions(structure, sparse),
+            ),
+            ("lag", self.lag.into(), count(structure.lag())),
+            ("observables", self.observables.into(), count(dictionary.observables().len())),
+            ("blocks", self.blocks.into(), count(dictionary.blocks().count())),
+            ("factors", self.factors.into(), count(factors)),
+            ("terms", self.terms.into(), count(dense_terms)),
+            // The constant is one of a model's terms, but not of these.
+            ("sparse terms", self.sparse_terms.into(), count(sparse_terms).saturating_sub(1)),
+        ];
+        let other = exact.into_iter().find(|(_, expected, found)| expected != found);
+        let larger = most.into_iter().find(|(_, most, found)| found > most);
+        other.or(larger).map_or(Ok(()), |(field, expected, found)| {
+            Err(Misfit { field, expected: expected.into(), found: found.into() })
+        })
+    }
+}
+
+fn count(number: usize) -> u32 {
+    u32::try_from(number).unwrap_or(u32::MAX)
+}
+
+/// What a signature allows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// To hold the robot, erase a slot and write the release to it.
+    Install = 1,
+    /// To run it at the next boot.
+    Activate = 2,
+    /// To keep it.
+    Confirm = 3,
+    /// To drop it.
+    Abort = 4,
+}
+
+impl Purpose {
+    /// In the order of their numbers.
+    pub const ALL: [Self; 4] = [Self::Install, Self::Activate, Self::Confirm, Self::Abort];
+}
+
+/// What is signed.
+///
+/// | offset | size | field |
+/// |---|---|---|
+/// | 0 | 16 | the bytes `koopman-release\0` |
+/// | 16 | 1 | [`Purpose`] |
+/// | 17 | 3 | zeros |
+/// | 20 | 4 | robot: CRC-32 of its name |
+/// | 24 | 4 | sequence number |
+/// | 28 | 4 | length of the blob |
+/// | 32 | 32 | SHA-256 of the blob |
+///
+/// ```
+/// use firmware_core::slots::Release;
+/// use firmware_core::update::{Purpose, statement};
+/// let release = Release { length: 0x01020304, sha256: [7; 32], sequence: 5, robot: 6 };
+/// let bytes = statement(Purpose::Confirm, &release);
+/// assert_eq!(&bytes[..24], b"koopman-release\0\x03\0\0\0\x06\0\0\0");
+/// assert_eq!(&bytes[24..], [&[5, 0, 0, 0, 4, 3, 2, 1][..], &[7; 32]].concat());
+/// ```
+pub fn statement(purpose: Purpose, release: &Release) -> [u8; 64] {
+    let Release { length, sha256, sequence, robot } = release;
+    let mut bytes = [0; 64];
+    let fields: [&[u8]; 6] = [
+        b"koopman-release\0",
+        &[purpose as u8, 0, 0, 0],
+        &robot.to_le_bytes(),
+        &sequence.to_le_bytes(),
+        &length.to_le_bytes(),
+        sha256,
+    ];
+    for (place, byte) in bytes.iter_mut().zip(fields.into_iter().flatten()) {
+        *place = *byte;
+    }
+    bytes
+}
+
+/// Whose releases are installed.
+pub trait Trust {
+    /// The first bytes of the key, `None` where everybody is trusted.
+    fn key(&self) -> Option<[u8; 8]>;
+
+    /// Whether the signature is right.
+    fn accepts(&self, statement: &[u8; 64], signature: &[u8]) -> bool;
+}
+
+/// An Ed25519 key (RFC 8032): releases that its owner has signed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PublicKey(pub [u8; 32]);
+
+impl Trust for PublicKey {
+    fn key(&self) -> Option<[u8; 8]> {
+        self.0.first_chunk().copied()
+    }
+
+    fn accepts(&self, statement: &[u8; 64], signature: &[u8]) -> bool {
+        let Ok(signature) = <[u8; SIGNATURE]>::try_from(signature) else { return false };
+        let signature = ed25519_compact::Signature::new(signature);
+        ed25519_compact::PublicKey::new(self.0).verify(statement, &signature).is_ok()
+    }
+}
+
+/// Everybody: for development only. The host is told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Anyone;
+
+impl Trust for Anyone {
+    fn key(&self) -> Option<[u8; 8]> {
+        None
+    }
+
+    fn accepts(&self, _: &[u8; 64], _: &[u8]) -> bool {
+        true
+    }
+}
+
+impl<T: Trust> Trust for Option<T> {
+    fn key(&self) -> Option<[u8; 8]> {
+        self.as_ref().and_then(Trust::key)
+    }
+
+    fn accepts(&self, statement: &[u8; 64], signature: &[u8]) -> bool {
+        self.as_ref().is_none_or(|trust| trust.accepts(statement, signature))
+    }
+}
+
+/// What a controller says of itself.
+#[derive(Clone, Copy, Debug)]
+pub struct Identity<'r> {
+    /// Firmware and version.
+    pub firmware: &'r str,
+    /// Name of the robot.
+    pub robot: &'r str,
+    /// Bytes of the factory model.
+    pub factory: &'r [u8],
+    /// What it has room for; the slots fill in theirs.
+    pub capacities: Capacities,
+    /// Most time to erase a sector, from the data sheet (ms).
+    pub erase_ms: u32,
+    /// Good ticks in a row before a model on trial can be confirmed.
+    pub good_ticks: u32,
+}
+
+/// Takes requests, as a [`Port`](crate::link::Port) hands them on.
+pub trait Updates {
+    /// A request has arrived; what can be answered at once.
+    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer>;
+
+    /// Whether there is something to do that takes long: only while the robot is at rest.
+    fn is_working(&self) -> bool;
+
+    /// Does a part of it: checks a signature, erases a sector, writes a chunk, reads a blob back.
+    fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer>;
+
+    /// Whether the robot has to be [held](crate::control_loop::Supervisor::hold) in Safe.
+    fn holds(&mut self, now_us: u64) -> bool;
+}
+
+/// A controller whose model is part of its image: every request is unknown.
+#[derive(Clone, Copy, Debug)]
+pub struct NoUpdates;
+
+impl Updates for NoUpdates {
+    fn receive(&mut self, request: &Request, _: Mode, _: u64) -> Option<Answer> {
+        let unknown = Refused::Unknown { variant: crate::link::REQUEST };
+        Some(Answer { number: request.number, say: Say::Refused(unknown) })
+    }
+
+    fn is_working(&self) -> bool {
+        false
+    }
+
+    fn work(&mut self, _: Mode, _: u64) -> Option<Answer> {
+        None
+    }
+
+    fn holds(&mut self, _: u64) -> bool {
+        false
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Session {
+    id: u32,
+    /// When it was heard last; `None`: at the next call.
+    heard_us: Option<u64>,
+}
+
+/// What is being done.
+#[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant)]
+enum Job {
+    /// What was asked.
+    Ask(Request),
+    /// The slot is being erased for a request of this number.
+    Erase(u8),
+}
+
+/// Installs models in [slots](crate::slots): the controller's end of an update.
+///
+/// `F` is the flash, `T` says whose releases are accepted, `A` whether a payload in the flash is a model
+/// that can run: map it, [parse](crate::parse_for) it, and ask the loop and [`Capacities::check`].
+#[derive(Debug)]
+pub struct Updater<'r, F, T, A> {
+    slots: Slots<F>,
+    trust: T,
+    accept: A,
+    identity: Identity<'r>,
+    /// What runs.
+    release: Release,
+    session: Option<Session>,
+    job: Option<Job>,
+    /// When the next signature may be looked at.
+    pause_until_us: u64,
+    wrong_signature: bool,
+    good: u32,
+    resets: bool,
+}
+
+impl<'r, F, T, A> Updater<'r, F, T, A>
+where
+    F: NorFlash,
+    T: Trust,
+    A: FnMut(Payload) -> bool,
+{
+    /// Decides what runs ([`Slots::boot`]), once at every power-on. `lowest` is the lowest sequence number
+    /// that the image accepts.
+    ///
+    /// # Errors
+    /// [`GeometryError`].
+    pub fn boot(
+        flash: F,
+        geometry: Geometry,
+        identity: Identity<'r>,
+        lowest: u32,
+        trust: T,
+        mut accept: A,
+    ) -> Result<(Self, Boot<F::Error>), GeometryError> {
+        let (slots, boot) = Slots::boot(flash, geometry, identity.robot, lowest, &mut accept)?;
+        let Identity { robot: name, factory, .. } = identity;
+        let (length, sha256) = (count(factory.len()), sha256(factory));
+        let factory = Release { length, sha256, sequence: 0, robot: robot(name) };
+        let release = slots.release().unwrap_or(factory);
+        let (session, job, pause_until_us) = (None, None, 0);
+        let (wrong_signature, good, resets) = (false, 0, false);
+        let updater = Self {
+            slots,
+            trust,
+            accept,
+            identity,
+            release,
+            session,
+            job,
+            pause_until_us,
+            wrong_signature,
+            good,
+            resets,
+        };
+        Ok((updater, boot))
+    }
+
+    /// The slots.
+    pub fn slots(&self) -> &Slots<F> {
+        &self.slots
+    }
+
+    /// A tick is over: does the trial go well? A tick is good unless the loop has an alarm that stops the
+    /// robot, or finds that the model is not the robot's.
+    pub fn ticked(&mut self, alarms: Alarms) {
+        let bad = alarms.intersects(Alarms::SAFE | Alarms::RESIDUAL);
+        self.good = if bad { 0 } else { self.good.saturating_add(1) };
+    }
+
+    /// Whether the controller is to be reset, as soon as its answers are on the line.
+    pub fn resets(&self) -> bool {
+        self.resets
+    }
+
+    fn trial(&self) -> Option<Trial> {
+        let needed = self.identity.good_ticks;
+        self.slots.on_trial().then(|| Trial { good: self.good.min(needed), needed })
+    }
+
+    fn hello(&self, mode: Mode) -> Hello {
+        let Identity { firmware, robot: name, capacities, .. } = self.identity;
+        Hello {
+            protocol: PROTOCOL,
+            firmware: beginning(firmware),
+            name: beginning(name),
+            robot: robot(name),
+            mode,
+            capacities: Capacities { room: self.slots.room(), ..capacities },
+            which: self.slots.running(),
+            release: self.release,
+            trial: self.trial(),
+            floor: self.slots.floor(),
+            key: self.trust.key(),
+        }
+    }
+
+    /// Whether a session is alive; that of an update that is over is not.
+    fn settle(&mut self, now_us: u64) {
+        if let Some(session) = &mut self.session {
+            let heard_us = *session.heard_us.get_or_insert(now_us);
+            // What takes long is no silence of the host.
+            if self.job.is_none() && now_us.saturating_sub(heard_us) > SILENCE_US {
+                self.session = None;
+            }
+        }
+        if self.wrong_signature {
+            self.wrong_signature = false;
+            self.pause_until_us = now_us.saturating_add(SIGNATURE_PAUSE_US);
+        }
+    }
+
+    /// Whether a signature may be looked at.
+    fn signed(&self, signature: &Signature, now_us: u64) -> Result<(), Refused> {
+        if self.trust.key().is_none() {
+            return Ok(());
+        }
+        if signature.len() != SIGNATURE {
+            return Err(Refused::Signature);
+        }
+        match self.pause_until_us.checked_sub(now_us) {
+            Some(us) if us > 0 => {
+                Err(Refused::Pause { ms: u32::try_from(us.div_ceil(1000)).unwrap_or(u32::MAX) })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether the request is of the session that is alive.
+    fn of_session(&mut self, id: u32, now_us: u64) -> Result<(), Refused> {
+        let session = self.session.as_mut().filter(|session| session.id == id);
+        session.ok_or(Refused::NoSession)?.heard_us = Some(now_us);
+        Ok(())
+    }
+
+    /// What can be said at once; `None` where there is something to do.
+    fn at_once(&mut self, ask: &Ask, now_us: u64) -> Result<Option<Say>, Refused> {
+        if self.resets && !matches!(ask, Ask::Activate { .. }) {
+            return Err(Refused::Working);
+        }
+        match ask {
+            // It was answered before.
+            Ask::Hello => {}
+            Ask::Begin { session: id, release, signature } => {
+                let same = self.slots.update() == Some(*release);
+                match &self.session {
+                    Some(session) if session.id != *id => return Err(Refused::InUse),
+                    // The answer was lost.
+                    Some(_) if same => {
+                        if let Some(written) = self.slots.written() {
+                            self.of_session(*id, now_us)?;
+                            return Ok(Some(Say::Begun { written }));
+                        }
+                    }
+                    _ => {}
+                }
+                self.slots.check(release).map_err(|error| match error {
+                    BeginError::OnTrial => Refused::OnTrial,
+                    BeginError::Length { room, .. } => Refused::Length { room },
+                    BeginError::BelowFloor { floor, .. } => Refused::BelowFloor { floor },
+                    BeginError::AnotherRobot { .. } => {
+                        Refused::AnotherRobot { robot: robot(self.identity.robot) }
+                    }
+                })?;
+                self.signed(signature, now_us)?;
+            }
+            Ask::Chunk { session, offset, bytes } => {
+                self.of_session(*session, now_us)?;
+                let release = self.slots.update().ok_or(Refused::NoSession)?;
+                let written = self.slots.written().ok_or(Refused::NoSession)?;
+                let room = release.length.saturating_sub(written);
+                if *offset != written || count(bytes.len()) > room {
+                    return Err(Refused::OutOfOrder { written });
+                }
+            }
+            Ask::Verify { session } => self.of_session(*session, now_us)?,
+            Ask::Activate { session, signature } => {
+                self.of_session(*session, now_us)?;
+                if self.resets {
+                    return Ok(Some(Say::Activated));
+                }
+                self.signed(signature, now_us)?;
+            }
+            Ask::Confirm { signature } => {
+                let Trial { good, needed } = self.trial().ok_or(Refused::NotOnTrial)?;
+                if good < needed {
+                    return Err(Refused::TooEarly { good, needed });
+                }
+                self.signed(signature, now_us)?;
+            }
+            Ask::Abort { session, signature } => {
+                self.of_session(*session, now_us)?;
+                self.signed(signature, now_us)?;
+            }
+        }
+        Ok(None)
+    }
+
+    /// Looks at a signature.
+    fn check(
+        &mut self,
+        purpose: Purpose,
+        release: &Release,
+        signature: &Signature,
+    ) -> Result<(), Refused> {
+        if self.trust.accepts(&statement(purpose, release), signature) {
+            return Ok(());
+        }
+        // From when this call is over.
+        self.wrong_signature = true;
+        Err(Refused::Signature)
+    }
+
+    /// Drops the update.
+    fn drop_update(&mut self) -> Result<(), Refused> {
+        self.session = None;
+        self.slots.abort().map_err(|_| Refused::Flash)
+    }
+
+    /// Does what takes long.
+    fn perform(&mut self, number: u8, ask: Ask) -> Result<Say, Refused> {
+        match ask {
+            Ask::Hello => Err(Refused::Unknown { variant: crate::link::REQUEST }),
+            Ask::Begin { session: id, release, signature } => {
+                self.check(Purpose::Install, &release, &signature)?;
+                self.session = Some(Session { id, heard_us: None });
+                if self.slots.update() == Some(release) && !self.slots.is_committed() {
+                    if let Some(written) = self.slots.written() {
+                        return Ok(Say::Begun { written });
+                    }
+                } else if self.slots.begin(&release).is_err() {
+                    // Checked when it arrived.
+                    return Err(Refused::NoSession);
+                }
+                self.job = Some(Job::Erase(number));
+                Ok(self.working())
+            }
+            Ask::Chunk { offset, bytes, .. } => {
+                self.slots.write(offset, &bytes).map_err(|error| match error {
+                    WriteError::OutOfOrder { expected: written, .. } => {
+                        Refused::OutOfOrder { written }
+                    }
+                    WriteError::Flash(_) => Refused::Flash,
+                    _ => Refused::NoSession,
+                })?;
+                Ok(Say::Written { written: self.slots.written().unwrap_or(0) })
+            }
+            Ask::Verify { .. } => {
+                let payload = self.slots.verify().map_err(|error| match error {
+                    VerifyError::NotWriting => Refused::NoSession,
+                    VerifyError::Incomplete { written, .. } => Refused::Incomplete { written },
+                    VerifyError::Hash => Refused::Hash,
+                    VerifyError::Flash(_) => Refused::Flash,
+                })?;
+                if !(self.accept)(payload) {
+                    self.drop_update()?;
+                    return Err(Refused::Model);
+                }
+                Ok(Say::Verified)
+            }
+            Ask::Activate { signature, .. } => {
+                let release = self.slots.update().ok_or(Refused::NotVerified)?;
+                self.check(Purpose::Activate, &release, &signature)?;
+                self.slots.commit().map_err(|error| match error {
+                    MarkError::NotReady => Refused::NotVerified,
+                    _ => Refused::Flash,
+                })?;
+                self.resets = true;
+                Ok(Say::Activated)
+            }
+            Ask::Confirm { signature } => {
+                let release = self.release;
+                self.check(Purpose::Confirm, &release, &signature)?;
+                self.slots.confirm().map_err(|error| match error {
+                    MarkError::NotReady => Refused::NotOnTrial,
+                    _ => Refused::Flash,
+                })?;
+                Ok(Say::Confirmed)
+            }
+            Ask::Abort { signature, .. } => {
+                let release = self.slots.update().ok_or(Refused::NoSession)?;
+                self.check(Purpose::Abort, &release, &signature)?;
+                self.drop_update()?;
+                Ok(Say::Aborted)
+            }
+        }
+    }
+
+    /// What is said while the slot is erased.
+    fn working(&self) -> Say {
+        // One sector more for what else there is to do.
+        let sectors = self.slots.sectors().saturating_add(1);
+        Say::Working { most_ms: sectors.saturating_mul(self.identity.erase_ms) }
+    }
+
+    /// Erases a sector; `None` until it was the last.
+    fn erase(&mut self) -> Option<Result<Say, Refused>> {
+        match self.slots.erase() {
+            Ok(0) => Some(Ok(Say::Begun { written: 0 })),
+            Ok(_) => None,
+            Err(_) => Some(Err(Refused::Flash)),
+        }
+    }
+}
+
+impl<F, T, A> Updates for Updater<'_, F, T, A>
+where
+    F: NorFlash,
+    T: Trust,
+    A: FnMut(Payload) -> bool,
+{
+    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer> {
+        self.settle(now_us);
+        let Request { number, ask } = request;
+        let answer = |say| Some(Answer { number: *number, say });
+        if *ask == Ask::Hello {
+            return answer(Say::Hello(self.hello(mode)));
+        }
+        if mode == Mode::Running {
+            return answer(Say::Refused(Refused::Busy));
+        }
+        match &self.job {
+            // It is on its way.
+            Some(Job::Ask(Request { number: known, .. })) if known == number => return None,
+            Some(Job::Erase(known)) if known == number => return answer(self.working()),
+            Some(_) => return answer(Say::Refused(Refused::Working)),
+            None => {}
+        }
+        match self.at_once(ask, now_us) {
+            Ok(Some(say)) => answer(say),
+            Ok(None) => {
+                self.job = Some(Job::Ask(request.clone()));
+                None
+            }
+            Err(refused) => answer(Say::Refused(refused)),
+        }
+    }
+
+    fn is_working(&self) -> bool {
+        self.job.is_some()
+    }
+
+    fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer> {
+        self.settle(now_us);
+        let (number, result) = match self.job.take()? {
+            // It was started in the meantime.
+            Job::Ask(Request { number, .. }) if mode == Mode::Running => {
+                (number, Err(Refused::Busy))
+            }
+            Job::Ask(Request { number, ask }) => (number, self.perform(number, ask)),
+            // Whoever calls this has not held the robot yet.
+            job @ Job::Erase(_) if mode != Mode::Safe => {
+                self.job = Some(job);
+                return None;
+            }
+            Job::Erase(number) => match self.erase() {
+                Some(result) => (number, result),
+                None => {
+                    self.job = Some(Job::Erase(number));
+                    return None;
+                }
+            },
+        };
+        if result == Err(Refused::Flash) {
+            self.session = None;
+        }
+        if let Some(session) = &mut self.session {
+            // It could not be heard while this took its time.
+            session.heard_us = None;
+        }
+        Some(Answer { number, say: result.unwrap_or_else(Say::Refused) })
+    }
+
+    fn holds(&mut self, now_us: u64) -> bool {
+        self.settle(now_us);
+        self.session.is_some()
+    }
+}
+
+/// As much of a text as there is room for.
+fn beginning<const C: usize>(text: &str) -> String<C> {
+    let mut beginning = String::new();
+    for character in text.chars() {
+        if beginning.push(character).is_err() {
+            break;
+        }
+    }
+    beginning
+}
