@@ -551,6 +551,27 @@ impl Updates for NoUpdates {
     }
 }
 
+impl<U: Updates> Updates for Option<U> {
+    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer> {
+        match self {
+            Some(updates) => updates.receive(request, mode, now_us),
+            None => NoUpdates.receive(request, mode, now_us),
+        }
+    }
+
+    fn is_working(&self) -> bool {
+        self.as_ref().is_some_and(Updates::is_working)
+    }
+
+    fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer> {
+        self.as_mut()?.work(mode, now_us)
+    }
+
+    fn holds(&mut self, now_us: u64) -> bool {
+        self.as_mut().is_some_and(|updates| updates.holds(now_us))
+    }
+}
+
 #[derive(Clone, Copy, Debug)]
 struct Session {
     id: u32,

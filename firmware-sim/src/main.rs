@@ -2,6 +2,7 @@
 
 use clap::{Args, Parser, Subcommand};
 use firmware_core::model::Structure;
+use firmware_core::update::PublicKey;
 use firmware_sim::Integrator;
 use firmware_sim::fault::Fault;
 use firmware_sim::paper::PaperLogs;
@@ -12,6 +13,7 @@ use firmware_sim::run::live::Live;
 use firmware_sim::run::log::Logger;
 use firmware_sim::run::scenario::{FaultText, Scenario};
 use firmware_sim::run::serve::{Door, serve};
+use firmware_sim::run::store::Store;
 use firmware_sim::run::summary::Summary;
 use firmware_sim::run::sweep;
 use std::error::Error;
@@ -63,7 +65,8 @@ enum Command {
 /// to talk to without hardware.
 ///
 /// Says where on its first line, such as `skid-rosbot on tcp:127.0.0.1:4000`, which is what
-/// `trainer monitor --port` takes. Without --drive the client has to send the commands.
+/// `trainer monitor --port` and `trainer flash --port` take. Without --drive the client has to send the
+/// commands. The model is the factory model in the image; every boot is told on standard error.
 #[derive(Args)]
 #[command(verbatim_doc_comment)]
 struct ServeArgs {
@@ -75,6 +78,13 @@ struct ServeArgs {
     /// A new pseudo-terminal instead
     #[arg(long, conflicts_with = "tcp")]
     pty: bool,
+    /// Install only models that were signed with this key, as `trainer keygen` writes it to NAME.pub
+    /// [default: everybody's]
+    #[arg(long, value_name = "FILE")]
+    public_key: Option<PathBuf>,
+    /// Keep the flash with its two model slots in this file [default: erased at every start]
+    #[arg(long, value_name = "FILE")]
+    flash: Option<PathBuf>,
     /// Drive at random, or by the scenario
     #[arg(long)]
     drive: bool,
@@ -363,6 +373,16 @@ fn serve_model(args: &ServeArgs) -> Result<(), Box<dyn Error>> {
     let structure = model.structure();
     let seconds = Some(args.seconds.unwrap_or(NO_END_S));
     let scenario = scenario((args.scenario.as_deref(), seconds, &args.faults), structure)?;
+    let key = args.public_key.as_deref().map(public_key).transpose()?;
+    let mut store = Store::new(&blob, key);
+    if let Some(file) = &args.flash {
+        store.keep(file.clone())?;
+    }
+    let robot = structure.robot().to_owned();
+    store.told = Box::new(move |boot| {
+        // Nobody may be reading.
+        let _ = writeln!(std::io::stderr(), "{:.2} s: {robot} {boot}", boot.at_us as f64 * 1e-6);
+    });
     let door = match args.pty {
         #[cfg(unix)]
         true => Door::pty().map_err(|e| format!("there is no pseudo-terminal: {e}"))?,
@@ -376,10 +396,35 @@ fn serve_model(args: &ServeArgs) -> Result<(), Box<dyn Error>> {
     let mut out = std::io::stdout();
     writeln!(out, "{} on {}", structure.robot(), door.name()?)?;
     out.flush()?;
-    let summary = serve(&model, &scenario, args.seed, door, (args.drive, args.speed));
+    if store.key.is_none() {
+        writeln!(
+            std::io::stderr(),
+            "WARNING: without --public-key everybody on this line may install a model: for \
+             development only"
+        )?;
+    }
+    let how = (args.drive, args.speed);
+    let summary = serve(&model, &scenario, args.seed, &mut store, door, how);
     let summary = summary.map_err(|e| named(&e))?;
     write!(out, "{}", summary.text())?;
     Ok(())
+}
+
+/// The key in a file: 64 hexadecimal digits.
+fn public_key(path: &Path) -> Result<PublicKey, String> {
+    let failed = |what: &str| format!("{}: {what}", path.display());
+    let text =
+        std::fs::read_to_string(path).map_err(|e| failed(&format!("cannot be read: {e}")))?;
+    let digits = text.trim();
+    let expected = "expected 64 hexadecimal digits, as `trainer keygen` writes them to NAME.pub";
+    let mut key = [0; 32];
+    if digits.len() != 2 * key.len() || !digits.bytes().all(|digit| digit.is_ascii_hexdigit()) {
+        return Err(failed(expected));
+    }
+    for (i, byte) in key.iter_mut().enumerate() {
+        *byte = u8::from_str_radix(&digits[2 * i..2 * i + 2], 16).map_err(|_| failed(expected))?;
+    }
+    Ok(PublicKey(key))
 }
 
 fn scenario(

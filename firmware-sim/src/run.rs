@@ -11,34 +11,39 @@
 //! | module | what lives there |
 //! |---|---|
 //! | [`scenario`] | what a run does |
-//! | `rig`, `host` (private) | a robot with its firmware; the laptop at the other end of the line |
+//! | `rig` (private) | a robot with its firmware |
+//! | [`host`] | the laptop at the other end of the line |
 //! | [`summary`] | what a run showed |
 //! | [`log`] | the telemetry as logs for the trainer |
 //! | [`figure`], [`live`] | predicted beside measured: a plot, and a view in the terminal |
+//! | [`store`] | the models in its flash, and who may install others |
 //! | [`serve`] | the same in real time, for a client on a port |
 //! | [`sweep`] | every fault on every robot, against what is expected |
 
 pub mod figure;
-mod host;
+pub mod host;
 pub mod live;
 pub mod log;
 mod rig;
 pub mod scenario;
 pub mod serve;
+pub mod store;
 pub mod summary;
 pub mod sweep;
 
 use crate::bench::{RosbotBench, SoftLegBench};
 use crate::fault::{Fault, FaultKind, Faults};
 use crate::faulty::FaultyHost;
+use crate::mcu::board::ResetCause;
 use crate::mcu::misuse::Misuse;
 use crate::mcu::uart::{self, UartEnd, UartSettings};
-use crate::mcu::{BrownOutDetector, Wire};
+use crate::mcu::{BrownOutDetector, VirtualClock, Wire};
+use embedded_io::Write as _;
 use firmware_core::control_loop::telemetry::{Frame, Telemetry};
 use firmware_core::control_loop::{ControlLoop as _, ControlLoopError, Mode};
 use firmware_core::link::Port;
 use firmware_core::model::{Model, Structure};
-use firmware_core::update::NoUpdates;
+use firmware_core::update::Updates as _;
 use firmware_core::{blob, cost};
 use heapless::spsc::Queue;
 use host::{Alone, Host, Laptop};
@@ -47,6 +52,7 @@ use scenario::{Controller, Scenario};
 use std::collections::VecDeque;
 use std::num::NonZeroU32;
 use std::path::Path;
+use store::{Loop, Speed, Store};
 use summary::{Summary, Watch};
 
 /// Voltage of the microcontroller's supply, and where its brown-out detector resets it (V): STM32F407,
@@ -55,6 +61,8 @@ const SUPPLY_VOLT: f64 = 3.3;
 const BROWN_OUT_VOLT: f64 = 2.7;
 /// Frames that wait to be sent.
 const QUEUE: usize = 8;
+/// Time from one look at the line to the next while a model is being installed (µs).
+const POLL_US: u64 = 250;
 /// Samples whose frames may be on their way, which is enough for a line of 100 baud. On a dead line the
 /// oldest are forgotten.
 const MOST_PENDING: usize = 4_096;
@@ -168,8 +176,12 @@ impl Blob {
     /// # Errors
     /// [`RunError::Blob`].
     pub fn model(&self) -> Result<Model<'_>, RunError> {
-        let bytes: &[u8] = bytemuck::cast_slice(&self.words);
-        firmware_core::parse(&bytes[..self.length]).map_err(RunError::Blob)
+        firmware_core::parse(self.bytes()).map_err(RunError::Blob)
+    }
+
+    /// The bytes.
+    pub fn bytes(&self) -> &[u8] {
+        &bytemuck::cast_slice(&self.words)[..self.length]
     }
 }
 
@@ -249,7 +261,23 @@ pub fn run(
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
     let laptop = |end, faults: &Faults, host| Alone { end: FaultyHost::new(end, faults), host };
-    with(model, scenario, seed, laptop, watcher)
+    with(model, scenario, seed, None, laptop, watcher)
+}
+
+/// Runs a controller that takes updates, with somebody at the other end of the line. The model is that of
+/// the store's factory.
+///
+/// # Errors
+/// [`RunError`].
+pub fn run_with<L: Laptop>(
+    model: &Model<'_>,
+    scenario: &Scenario,
+    seed: u64,
+    store: &mut Store,
+    laptop: impl FnOnce(UartEnd) -> L,
+) -> Result<Summary, RunError> {
+    let laptop = |end, _: &Faults, _| laptop(end);
+    with(model, scenario, seed, Some(store), laptop, &mut |_| Ok(()))
 }
 
 /// Runs a model with somebody at the other end of the line, who is given that end and a host.
@@ -257,6 +285,7 @@ fn with<L: Laptop>(
     model: &Model<'_>,
     scenario: &Scenario,
     seed: u64,
+    store: Option<&mut Store>,
     laptop: impl FnOnce(UartEnd, &Faults, Host) -> L,
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
@@ -264,8 +293,8 @@ fn with<L: Laptop>(
     scenario.check(model.structure().inputs().len())?;
     let run = (robot, scenario, seed);
     match robot {
-        Robot::Rosbot => run_rig::<RosbotBench, L, 3>(model, run, laptop, watcher),
-        Robot::SoftLeg => run_rig::<SoftLegBench, L, 2>(model, run, laptop, watcher),
+        Robot::Rosbot => run_rig::<RosbotBench, L, 3>(model, run, store, laptop, watcher),
+        Robot::SoftLeg => run_rig::<SoftLegBench, L, 2>(model, run, store, laptop, watcher),
     }
 }
 
@@ -276,9 +305,75 @@ struct Then<const N: usize> {
     path: Vec<f32>,
 }
 
+/// A rig with all that is around its firmware, from one tick to the next.
+struct World<'w, R, L, const N: usize> {
+    rig: R,
+    laptop: L,
+    clock: VirtualClock,
+    faults: Faults,
+    supply: Wire<f64>,
+    detector: BrownOutDetector,
+    summary: Watch<N>,
+    pending: VecDeque<Then<N>>,
+    watcher: &'w mut Watcher<'w>,
+    /// The next tick.
+    tick: u64,
+}
+
+impl<R: Rig<N>, L: Laptop, const N: usize> World<'_, R, L, N> {
+    fn now_us(&self) -> u64 {
+        self.clock.now_ns() / 1000
+    }
+
+    /// When the next tick is due (µs). Timers go on while a tick is late: it begins when it can.
+    fn due_us(&self) -> u64 {
+        self.tick * R::TICK_US + self.faults.late_by_us(R::TICK_US)
+    }
+
+    /// Goes on to the next tick; whether there is power for it.
+    fn next_tick(&mut self, model: &Model<'_>) -> Result<bool, RunError> {
+        self.rig.advance_us(self.due_us().saturating_sub(self.now_us()));
+        self.rig.apply(&self.faults);
+        let missing = self.faults.act(FaultKind::BrownOut, None).unwrap_or(0.0);
+        self.supply.set(SUPPLY_VOLT * (1.0 - missing));
+        self.turn(model)?;
+        self.tick += 1;
+        let runs = self.detector.runs(self.rig.board());
+        if !runs {
+            self.summary.off(self.now_us(), self.rig.is_off());
+        }
+        Ok(runs)
+    }
+
+    /// Lets the laptop have its turn.
+    fn turn(&mut self, model: &Model<'_>) -> std::io::Result<()> {
+        let now_us = self.now_us();
+        let Self { laptop, pending, summary, watcher, .. } = self;
+        laptop.turn(now_us, &mut |frame| {
+            while pending.front().is_some_and(|then| then.time_us < frame.time_us) {
+                pending.pop_front();
+            }
+            let Some(then) = pending.pop_front_if(|then| then.time_us == frame.time_us) else {
+                return Ok(());
+            };
+            summary.sample(model, frame, &then.truth);
+            watcher(&Seen { frame, truth: &then.truth, path: &then.path })
+        })
+    }
+
+    /// A robot at rest was kept waiting on purpose: ticks that were due in the meantime are left out.
+    fn leave_out(&mut self, mode: Mode) {
+        let next = self.now_us().div_ceil(R::TICK_US);
+        let left_out = next.saturating_sub(self.tick);
+        self.summary.left_out(mode, left_out);
+        self.tick += left_out;
+    }
+}
+
 fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     model: &Model<'_>,
     (robot, scenario, seed): (Robot, &Scenario, u64),
+    mut store: Option<&mut Store>,
     laptop: impl FnOnce(UartEnd, &Faults, Host) -> L,
     watcher: &mut Watcher<'_>,
 ) -> Result<Summary, RunError> {
@@ -297,94 +392,137 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     let line = UartSettings {
         baud: NonZeroU32::new(scenario.line.baud).unwrap_or(NonZeroU32::MIN),
         loss: scenario.line.loss,
+        doubling: scenario.line.doubling,
         bit_flip: scenario.line.bit_flip,
         ..UartSettings::default()
     };
     let (host_end, mut serial) = uart::pair(&clock, line, seed);
-    let mut host = laptop(host_end, &faults, Host::new(scenario, R::TICK_US, seed));
+    let laptop = laptop(host_end, &faults, Host::new(scenario, R::TICK_US, seed));
     let supply = Wire::new(SUPPLY_VOLT);
-    let mut detector = BrownOutDetector::new(&supply, BROWN_OUT_VOLT, 0.1);
+    let detector = BrownOutDetector::new(&supply, BROWN_OUT_VOLT, 0.1);
 
-    let instructions = robot.instructions(model, &scenario.controller);
-    let Controller { clock_mhz, cycles_per_instruction, .. } = scenario.controller;
-    let cost_us =
-        instructions.map(|count| (count as f64 * cycles_per_instruction / clock_mhz).ceil() as u64);
+    let controller = match store {
+        Some(_) => store::with_line(&scenario.controller),
+        None => scenario.controller,
+    };
+    let Controller { clock_mhz, cycles_per_instruction, .. } = controller;
+    let cost_us = |model: &Model<'_>| {
+        let instructions = robot.instructions(model, &controller);
+        instructions.map(|count| (count as f64 * cycles_per_instruction / clock_mhz).ceil() as u64)
+    };
     let ticks = (scenario.seconds * 1e6 / R::TICK_US as f64).round().max(1.0) as u64;
-    let mut summary = Watch::<N>::new(model, robot, scenario, seed, cost_us);
-    let mut pending: VecDeque<Then<N>> = VecDeque::new();
-    let lag = model.structure().lag() as u64;
+    let summary = Watch::<N>::new(model, robot, scenario, seed, cost_us(model));
+    let installed = store.as_ref().map(|store| {
+        let of = Loop {
+            robot: model.structure().robot().to_owned(),
+            states: N,
+            tick_us: R::TICK_US,
+            sample_us: R::TICK_US * R::TICKS_PER_SAMPLE,
+            steps: 2 + R::AHEAD as u64,
+        };
+        store.installed(of, Speed { clock: clock.clone(), controller }, rig.board(), seed)
+    });
+    let pending = VecDeque::new();
+    let mut world =
+        World { rig, laptop, clock, faults, supply, detector, summary, pending, watcher, tick: 0 };
     let mut boots = 0;
-    let mut tick = 0;
 
-    while tick < ticks {
-        // A boot: until the end or the next reset.
+    // Each round is a boot, until the end or the next reset.
+    'boots: while world.tick < ticks {
+        if !world.next_tick(model)? {
+            continue;
+        }
+        boots += 1;
+        let (mut updates, chosen) = match &installed {
+            Some(installed) => {
+                let (updater, chosen, booted) = installed.boot();
+                store.as_deref_mut().map(|store| store.booted(booted, installed)).transpose()?;
+                (Some(updater), chosen)
+            }
+            None => (None, None),
+        };
+        let parsed = chosen.as_ref().map(Blob::model).transpose()?;
+        let model = parsed.as_ref().unwrap_or(model);
+        let cost_us = cost_us(model);
+        let lag = model.structure().lag() as u64;
         let mut queue = Queue::<Frame, QUEUE>::new();
         let (producer, mut frames) = queue.split();
-        let mut firmware = None;
-        let mut producer = Some(producer);
+        let telemetry = Telemetry::new(producer);
+        let booted = world.rig.boot(model, &world.faults, seed.wrapping_add(boots), telemetry);
+        let mut firmware = booted.map_err(RunError::Firmware)?;
         let (mut port, mut of_boot) = (Port::new(), 0);
-        while tick < ticks {
-            // Timers go on while a tick is late: it begins when it can.
-            let due_us = tick * R::TICK_US + faults.late_by_us(R::TICK_US);
-            let now_us = clock.now_ns() / 1000;
-            rig.advance_us(due_us.saturating_sub(now_us));
-            rig.apply(&faults);
-            supply.set(SUPPLY_VOLT * (1.0 - faults.act(FaultKind::BrownOut, None).unwrap_or(0.0)));
-            let seen = host.turn(clock.now_ns() / 1000, &mut |frame| {
-                while pending.front().is_some_and(|then| then.time_us < frame.time_us) {
-                    pending.pop_front();
-                }
-                let Some(then) = pending.pop_front_if(|then| then.time_us == frame.time_us) else {
-                    return Ok(());
-                };
-                summary.sample(model, frame, &then.truth);
-                watcher(&Seen { frame, truth: &then.truth, path: &then.path })
-            });
-            seen?;
-            tick += 1;
-            if !detector.runs(rig.board()) {
-                summary.off(clock.now_ns() / 1000, rig.is_off());
-                if firmware.is_some() {
-                    break;
-                }
-                continue;
+        let mut was_on_trial = updates.as_ref().is_some_and(|u| u.slots().on_trial());
+        loop {
+            let mut began_us = world.now_us();
+            port.receive(&mut serial, &mut firmware, &mut updates, began_us);
+            if world.now_us() > began_us {
+                // Something of an update was done. Its tick may be over by now.
+                world.leave_out(firmware.mode());
+                began_us = world.now_us();
             }
-            if firmware.is_none() {
-                let telemetry = producer.take().map(Telemetry::new);
-                let Some(telemetry) = telemetry else { break };
-                boots += 1;
-                let booted = rig.boot(model, &faults, seed.wrapping_add(boots), telemetry);
-                firmware = Some(booted.map_err(RunError::Firmware)?);
-            }
-            let Some(firmware) = firmware.as_mut() else { break };
-
-            let began_us = clock.now_ns() / 1000;
-            port.receive(&mut serial, firmware, &mut NoUpdates, began_us);
             let is_sample = of_boot % R::TICKS_PER_SAMPLE == 0;
             // While the model's history fills there is nothing to predict.
             let predicts = is_sample && of_boot / R::TICKS_PER_SAMPLE >= lag;
             of_boot += 1;
-            let truth = rig.truth();
+            let truth = world.rig.truth();
             firmware.tick(began_us);
             if is_sample {
                 let path = firmware.path().to_vec();
-                if pending.len() == MOST_PENDING {
-                    pending.pop_front();
+                if world.pending.len() == MOST_PENDING {
+                    world.pending.pop_front();
                 }
-                pending.push_back(Then { time_us: began_us, truth, path });
+                world.pending.push_back(Then { time_us: began_us, truth, path });
             }
-            rig.advance_us(cost_us[usize::from(!predicts)]);
-            let ended_us = clock.now_ns() / 1000;
+            world.rig.advance_us(cost_us[usize::from(!predicts)]);
+            let ended_us = world.now_us();
             let mode = firmware.finish(ended_us);
             port.send(&mut frames, &mut serial);
-            summary.tick(tick - 1, [began_us, ended_us], mode, rig.is_off());
+            let off = world.rig.is_off();
+            world.summary.tick(world.tick - 1, [began_us, ended_us], mode, off);
+
+            // At rest there is time for updates until the next tick.
+            while let Some(updater) = &mut updates
+                && firmware.mode() != Mode::Running
+                && (updater.is_working() || updater.holds(world.now_us()))
+                && world.now_us() + POLL_US < world.due_us()
+            {
+                world.rig.advance_us(POLL_US);
+                world.turn(model)?;
+                port.receive(&mut serial, &mut firmware, updater, world.now_us());
+                port.send(&mut frames, &mut serial);
+                if world.now_us() > world.due_us() {
+                    world.leave_out(firmware.mode());
+                }
+            }
+            if let Some(updater) = &mut updates {
+                updater.ticked(firmware.alarms());
+                let on_trial = updater.slots().on_trial();
+                if std::mem::replace(&mut was_on_trial, on_trial) != on_trial
+                    && let (Some(store), Some(installed)) = (&mut store, &installed)
+                {
+                    store.save(installed)?;
+                }
+                if updater.resets() && port.is_sent() && serial.flush().is_ok() {
+                    world.rig.board().reset(ResetCause::Software);
+                    break;
+                }
+            }
+            if world.tick >= ticks {
+                break 'boots;
+            }
+            if !world.next_tick(model)? {
+                break;
+            }
         }
     }
-    let resets = rig.board().resets();
-    if let Some(misuse) = rig.board().misuse() {
+    if let (Some(store), Some(installed)) = (store, &installed) {
+        store.save(installed)?;
+    }
+    let resets = world.rig.board().resets();
+    if let Some(misuse) = world.rig.board().misuse() {
         return Err(RunError::Misuse(misuse));
     }
-    Ok(summary.finish(&faults, resets, host.counts()))
+    Ok(world.summary.finish(&world.faults, resets, world.laptop.counts()))
 }
 
 /// The time in `mode` is counted under its number.

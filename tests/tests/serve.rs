@@ -11,6 +11,7 @@ use firmware_core::link::{MAX_FRAME, Message, Received, Receiver, encode};
 use firmware_sim::run::log::Logger;
 use firmware_sim::run::scenario::Scenario;
 use firmware_sim::run::serve::{Door, serve};
+use firmware_sim::run::store::Store;
 use firmware_sim::run::summary::Summary;
 use firmware_sim::run::{self, Blob};
 use trainer::edmd;
@@ -43,7 +44,9 @@ fn served(
 ) -> (String, JoinHandle<Summary>) {
     let (port, blob) = (door.name().unwrap(), blob(name));
     let thread = std::thread::spawn(move || {
-        serve(&blob.model().unwrap(), &scenario, 7, door, (drives, SPEED)).unwrap()
+        let mut store = Store::new(&blob, None);
+        let how = (drives, SPEED);
+        serve(&blob.model().unwrap(), &scenario, 7, &mut store, door, how).unwrap()
     });
     (port, thread)
 }

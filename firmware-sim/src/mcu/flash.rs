@@ -151,6 +151,8 @@ struct Chip {
     clock: VirtualClock,
     rng: ChaCha8Rng,
     has_power: bool,
+    /// Time to erase a sector, whatever its size (ns), instead of [`ERASE_NS`].
+    erase_ns: Option<u64>,
     /// Bytes to program and sectors to erase until the power fails.
     steps_left: Option<u64>,
     counts: FlashCounts,
@@ -179,6 +181,7 @@ impl Flash {
             clock: board.clock().clone(),
             rng: stream(seed, 0),
             has_power: true,
+            erase_ns: None,
             steps_left: None,
             counts: FlashCounts::default(),
         })))
@@ -209,6 +212,11 @@ impl Flash {
         let start = found[0].range.start;
         let capacity = found.len() * ERASE;
         Ok(Region { chip: self.0.clone(), first_sector: first, start, capacity })
+    }
+
+    /// Erases every sector in so much time from now on (ns): the longest that a data sheet allows, say.
+    pub fn set_erase_ns(&self, erase_ns: u64) {
+        self.0.borrow_mut().erase_ns = Some(erase_ns);
     }
 
     /// Lets the power fail after so many more steps: inside the byte programmed or the sector erased
@@ -306,7 +314,8 @@ impl Chip {
         *erases += 1;
         let range = range.clone();
         let fits = ERASE_NS.iter().find(|(len, _)| range.len() <= *len);
-        self.clock.advance_ns(fits.unwrap_or(&ERASE_NS[2]).1);
+        let typical_ns = fits.unwrap_or(&ERASE_NS[2]).1;
+        self.clock.advance_ns(self.erase_ns.unwrap_or(typical_ns));
         self.counts.erased_sectors += 1;
         let survives = self.survives_step();
         if survives {

@@ -14,17 +14,19 @@ const AGAIN_US: u64 = 500_000;
 
 /// What reached the host.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Counts {
-    pub(crate) frames: u64,
+pub struct Counts {
+    /// Frames.
+    pub frames: u64,
     /// Frames whose numbers are missing.
-    pub(crate) lost: u64,
+    pub lost: u64,
     /// Frames that the loop could not put into its queue.
-    pub(crate) dropped: u64,
-    pub(crate) damaged: u64,
+    pub dropped: u64,
+    /// Frames damaged on the line.
+    pub damaged: u64,
 }
 
 /// Whoever is at the host's end of the line.
-pub(crate) trait Laptop {
+pub trait Laptop {
     /// Takes what arrived, `frame` each frame, and sends what is due.
     fn turn(
         &mut self,

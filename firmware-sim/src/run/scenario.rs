@@ -116,6 +116,8 @@ pub struct LineSettings {
     pub baud: u32,
     /// Probability that a byte is lost.
     pub loss: f64,
+    /// Probability that a byte arrives twice.
+    pub doubling: f64,
     /// Probability that a bit of a byte is flipped.
     pub bit_flip: f64,
 }
@@ -123,7 +125,7 @@ pub struct LineSettings {
 impl Default for LineSettings {
     /// The ROSbot's 576,000 baud, without errors.
     fn default() -> Self {
-        Self { baud: 576_000, loss: 0.0, bit_flip: 0.0 }
+        Self { baud: 576_000, loss: 0.0, doubling: 0.0, bit_flip: 0.0 }
     }
 }
 
@@ -253,9 +255,10 @@ impl Scenario {
             cycles_per_instruction,
             is_positive(cycles_per_instruction),
         )?;
-        let LineSettings { baud, loss, bit_flip } = self.line;
+        let LineSettings { baud, loss, doubling, bit_flip } = self.line;
         check("baud", positive, baud.into(), baud > 0)?;
         check("loss", share, loss, is_share(loss))?;
+        check("doubling", share, doubling, is_share(doubling))?;
         check("bit_flip", share, bit_flip, is_share(bit_flip))
     }
 }

@@ -8,6 +8,7 @@ use crate::fault::Faults;
 use crate::mcu::uart::UartEnd;
 use crate::run::host::{Counts, Host, Laptop};
 use crate::run::scenario::Scenario;
+use crate::run::store::Store;
 use crate::run::summary::Summary;
 use crate::run::{RunError, with};
 use embedded_io::{Read as _, ReadReady as _, Write as _};
@@ -179,7 +180,7 @@ impl Laptop for Remote {
 
 /// Runs a model's robot for a client at the door, `speed` times as fast as reality (0: as fast as it
 /// goes), for as long as the scenario says. With `drives`, its script drives the robot; without, the client
-/// has to.
+/// has to. The client may install other models in the store, whose factory model this one is.
 ///
 /// # Errors
 /// [`RunError`].
@@ -187,6 +188,7 @@ pub fn serve(
     model: &Model<'_>,
     scenario: &Scenario,
     seed: u64,
+    store: &mut Store,
     door: Door,
     (drives, speed): (bool, f64),
 ) -> Result<Summary, RunError> {
@@ -201,5 +203,5 @@ pub fn serve(
         began: Instant::now(),
         speed,
     };
-    with(model, scenario, seed, laptop, &mut |_| Ok(()))
+    with(model, scenario, seed, Some(store), laptop, &mut |_| Ok(()))
 }

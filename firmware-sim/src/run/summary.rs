@@ -259,6 +259,11 @@ impl<const N: usize> Watch<N> {
         }
     }
 
+    /// Ticks were left out while the robot was at rest.
+    pub(crate) fn left_out(&mut self, mode: Mode, ticks: u64) {
+        self.ticks[number(mode)] += ticks;
+    }
+
     /// The microcontroller has no supply.
     pub(crate) fn off(&mut self, now_us: u64, off: bool) {
         let summary = &mut self.summary;
