@@ -401,10 +401,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
     let supply = Wire::new(SUPPLY_VOLT);
     let detector = BrownOutDetector::new(&supply, BROWN_OUT_VOLT, 0.1);
 
-    let controller = match store {
-        Some(_) => store::with_line(&scenario.controller),
-        None => scenario.controller,
-    };
+    let controller = scenario.controller;
     let Controller { clock_mhz, cycles_per_instruction, .. } = controller;
     let cost_us = |model: &Model<'_>| {
         let instructions = robot.instructions(model, &controller);

@@ -750,6 +750,7 @@ fn every_alarm_in_every_mode() {
         Alarms::BAD_COMMAND,
         Alarms::OUT_OF_RANGE,
         Alarms::SENSOR_LATE,
+        Alarms::UPDATE,
     ];
     for (bit, (alarm, name)) in Alarms::all().enumerate() {
         assert_eq!(alarm.bits(), 1 << bit, "{name}");
@@ -775,6 +776,38 @@ fn every_alarm_in_every_mode() {
         assert!(supervisor.take_recent().contains(alarm), "a reset does not hide it from the host");
         assert_eq!(supervisor.take_recent(), Alarms::none());
     }
+}
+
+#[test]
+fn a_robot_at_rest_is_held_in_safe_and_a_running_one_is_not() {
+    let mut supervisor = Supervisor::new(Timing { period_us: 10, watchdog_us: 1000 });
+    supervisor.begin(0);
+    supervisor.start();
+    supervisor.hold(true);
+    assert_eq!((supervisor.mode(), supervisor.alarms()), (Mode::Running, Alarms::none()));
+    supervisor.stop();
+    for _ in 0..3 {
+        supervisor.hold(true);
+        for lead_out in [Supervisor::reset, Supervisor::start, Supervisor::stop] {
+            lead_out(&mut supervisor);
+            assert_eq!((supervisor.mode(), supervisor.alarms()), (Mode::Safe, Alarms::UPDATE));
+        }
+    }
+    assert_eq!(supervisor.take_recent(), Alarms::UPDATE);
+    // It took as long as it took.
+    supervisor.pause();
+    supervisor.begin(1_000_000);
+    assert_eq!(supervisor.alarms(), Alarms::UPDATE);
+    supervisor.hold(false);
+    assert_eq!(supervisor.mode(), Mode::Safe, "only a reset leads out");
+    supervisor.reset();
+    supervisor.start();
+    supervisor.pause();
+    supervisor.begin(2_000_000);
+    assert_eq!(
+        (supervisor.mode(), supervisor.alarms()),
+        (Mode::Safe, Alarms::LATE | Alarms::HOST_SILENT)
+    );
 }
 
 #[test]

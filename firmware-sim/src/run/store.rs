@@ -19,8 +19,6 @@ pub const ERASE_MS: u32 = 4_000;
 pub const SIGNATURE_INSTRUCTIONS: u64 = 1_680_000;
 /// Instructions per byte of a blob that is hashed, parsed and predicted with: an estimate.
 const BLOB_INSTRUCTIONS: u64 = 100;
-/// Instructions to take what a full line brings in a tick, 128 bytes: an estimate.
-const LINE_INSTRUCTIONS: u32 = 128 * 40;
 /// Time that a trial has to be good for (s).
 const GOOD_S: f64 = 10.0;
 
@@ -190,12 +188,6 @@ pub(crate) struct Loop {
     pub(crate) sample_us: u64,
     /// Predictions per tick, at most.
     pub(crate) steps: u64,
-}
-
-/// Of a controller whose line may be full.
-pub(crate) fn with_line(controller: &Controller) -> Controller {
-    let tick_instructions = controller.tick_instructions.saturating_add(LINE_INSTRUCTIONS);
-    Controller { tick_instructions, ..*controller }
 }
 
 /// Models in the flash of a board.
