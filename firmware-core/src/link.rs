@@ -38,6 +38,8 @@ use crate::update::{Answer, Refused, Request, Say, Updates};
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
 /// room for takes 204 bytes, the longest chunk of a blob 216.
 pub const MAX_FRAME: usize = 256;
+/// Number of [`Message::Inputs`].
+const INPUTS: u8 = 3;
 /// Number of [`Message::Request`].
 pub(crate) const REQUEST: u8 = 5;
 
@@ -284,7 +286,6 @@ impl Port {
         now_us: u64,
     ) -> Option<Answer> {
         let refused = |number, refused| Some(Answer { number, say: Say::Refused(refused) });
-        let unknown = |variant| refused(0, Refused::Unknown { variant });
         let understood = match &received {
             Received::Message(Message::Request(request)) => {
                 return updates.receive(request, robot.mode(), now_us);
@@ -297,10 +298,10 @@ impl Port {
         }
         self.damaged = self.damaged.saturating_add(1);
         match received {
-            // Its number of inputs is another, or it is one for the host.
-            Received::Message(Message::Frame(_)) => unknown(4),
-            Received::Message(Message::Answer(_)) => unknown(6),
-            Received::Message(_) => unknown(3),
+            // For the host: an echo, or another controller, which would answer in its turn, for ever.
+            Received::Message(Message::Frame(_) | Message::Answer(_)) => None,
+            // Its number of inputs is another.
+            Received::Message(_) => refused(0, Refused::Unknown { variant: INPUTS }),
             Received::Unknown { variant, number } => refused(number, Refused::Unknown { variant }),
             Received::TooLong => {
                 let most = u32::try_from(MAX_FRAME).unwrap_or(u32::MAX);

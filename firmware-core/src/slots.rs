@@ -91,8 +91,8 @@
 //!   falls to that of the other slot. If only its payload does, the floor stays, an older model in the
 //!   other slot is refused, and the factory model runs until an update comes.
 //! - Sequence numbers and hashes are checked here; who may set them is [`update`](crate::update)'s business.
-//! - A flash with error correction may answer a torn word with a fault instead of an error: its driver has
-//!   to turn it into one, and the slot counts as empty.
+//! - A flash with error correction may answer a torn word with a fault: its driver has to turn it into an
+//!   error, which counts as a torn cell, as an empty slot, or, in the reject mark, as one that does not run.
 //!
 //! ```
 //! # use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash};
@@ -669,7 +669,8 @@ impl<F: NorFlash> Slots<F> {
         let records = Side::BOTH.map(|side| slots.settled(side));
         let state = |record: &Result<Record, _>| record.as_ref().ok().map(Record::state);
         for record in records.iter().flatten() {
-            if record.state() == State::Confirmed {
+            // What another robot's firmware left behind says nothing about this one.
+            if record.state() == State::Confirmed && record.header.robot == robot {
                 slots.floor = slots.floor.max(record.header.sequence);
             }
         }
@@ -1040,23 +1041,29 @@ impl<F: NorFlash> Slots<F> {
     }
 
     fn record(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
-        let mut bytes = [0; RECORD];
+        let mut bytes = [0; HEADER];
         self.flash.read(self.at(side, 0), &mut bytes).map_err(Refusal::Flash)?;
-        let (header, cells) = bytes.split_at_checked(HEADER).ok_or(Refusal::Empty)?;
-        let check = check_of(header);
-        let header = Header::decode(header).ok_or(Refusal::Empty)?;
+        let check = check_of(&bytes);
+        let header = Header::decode(&bytes).ok_or(Refusal::Empty)?;
         let header = header.map_err(|Unreadable| Refusal::Layout)?;
         if header.length == 0 || header.length > self.room() {
             return Err(Refusal::Layout);
         }
-        let (cells, _) = cells.as_chunks::<CELL>();
-        let pairs = cells.chunks_exact(2).zip(Mark::ALL);
-        let mut marks = pairs.map(|(cells, mark)| {
+        // One by one: with error correction a torn cell may be an error, and the others say enough.
+        let mut marks = Mark::ALL.map(|mark| (mark, Cells::default()));
+        for (mark, read) in &mut marks {
             let set = mark.cell(check);
-            cells.iter().fold(Cells::default(), |read, cell| read.read(cell, &set))
-        });
-        let mut next = || marks.next().ok_or(Refusal::Empty);
-        let (committed, trial, confirmed, rejected) = (next()?, next()?, next()?, next()?);
+            for cell in mark.cells() {
+                let mut found = [0; CELL];
+                match self.flash.read(self.at(side, cell), &mut found) {
+                    // A slot that may have been rejected does not run.
+                    Err(error) if *mark == Mark::Rejected => return Err(Refusal::Flash(error)),
+                    Err(_) => {}
+                    Ok(()) => *read = read.read(&found, &set),
+                }
+            }
+        }
+        let [(_, committed), (_, trial), (_, confirmed), (_, rejected)] = marks;
         Ok(Record { header, check, committed, trial, confirmed, rejected })
     }
 

@@ -768,6 +768,9 @@ where
                 if *offset != written || count(bytes.len()) > room {
                     return Err(Refused::OutOfOrder { written });
                 }
+                if bytes.is_empty() {
+                    return Ok(Some(Say::Written { written }));
+                }
             }
             Ask::Verify { session } => self.of_session(*session, now_us)?,
             Ask::Activate { session, signature } => {
@@ -842,12 +845,18 @@ where
                 Ok(Say::Written { written: self.slots.written().unwrap_or(0) })
             }
             Ask::Verify { .. } => {
-                let payload = self.slots.verify().map_err(|error| match error {
-                    VerifyError::NotWriting => Refused::NoSession,
-                    VerifyError::Incomplete { written, .. } => Refused::Incomplete { written },
-                    VerifyError::Hash => Refused::Hash,
-                    VerifyError::Flash(_) => Refused::Flash,
-                })?;
+                let payload = match self.slots.verify() {
+                    Ok(payload) => payload,
+                    Err(VerifyError::NotWriting) => return Err(Refused::NoSession),
+                    Err(VerifyError::Incomplete { written, .. }) => {
+                        return Err(Refused::Incomplete { written });
+                    }
+                    Err(VerifyError::Flash(_)) => return Err(Refused::Flash),
+                    Err(VerifyError::Hash) => {
+                        self.session = None;
+                        return Err(Refused::Hash);
+                    }
+                };
                 if !(self.accept)(payload) {
                     self.drop_update()?;
                     return Err(Refused::Model);

@@ -11,6 +11,7 @@ use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
 use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
+use firmware_sim::run::store::{BLOB_INSTRUCTIONS, LINE_INSTRUCTIONS, SIGNATURE_INSTRUCTIONS};
 
 /// Random numbers: xorshift64*.
 struct Random(u64);
@@ -255,6 +256,19 @@ fn measure(image: &str, blobs: &[(String, Vec<u8>)]) -> Vec<Row> {
     }
     let mut lines = text.lines();
     println!("{}", lines.next().unwrap_or_default());
+    let update = lines.next().unwrap_or_default();
+    println!("{update}");
+    let number = |name: &str| -> f64 {
+        let after = update.split_once(name).map(|(_, rest)| rest.split([',', ' ']).next());
+        after.flatten().and_then(|n| n.parse().ok()).expect("a number")
+    };
+    // What the simulated controller is charged with.
+    let signature = number("signature ") / SIGNATURE_INSTRUCTIONS as f64;
+    assert!((signature - 1.0).abs() < 0.02, "{signature} of the instructions of a signature");
+    let blob = (number("hash ") + number("parse ")) / BLOB_INSTRUCTIONS as f64;
+    assert!((blob - 1.0).abs() < 0.02, "{blob} of the instructions per byte of a blob");
+    let line = number("line ") / f64::from(LINE_INSTRUCTIONS);
+    assert!((line - 1.0).abs() < 0.02, "{line} of the instructions per byte of the line");
     let rows = lines.zip(blobs).map(|(line, (name, blob))| {
         let measured = line.split(' ').nth(2).and_then(|n| n.parse().ok()).expect("a count");
         let mut words = vec![0_u32; blob.len() / 4];

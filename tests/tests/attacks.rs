@@ -18,7 +18,7 @@ use firmware_core::update::{
 use firmware_sim::mcu::UartEnd;
 use firmware_sim::run::host::{Counts, Laptop};
 use firmware_sim::run::scenario::{Controller, Scenario};
-use firmware_sim::run::store::Store;
+use firmware_sim::run::store::{LINE_INSTRUCTIONS, Store};
 use firmware_sim::run::summary::Summary;
 use firmware_sim::run::{Blob, run_with};
 use rand::RngExt;
@@ -168,7 +168,9 @@ impl Laptop for Hand {
 
 /// Every tick is charged for as much as a full line can bring in it.
 fn scenario(seconds: f64) -> Scenario {
-    let controller = Controller { tick_instructions: 2_000 + 128 * 40, ..Controller::default() };
+    let usual = Controller::default();
+    let tick_instructions = usual.tick_instructions + 128 * LINE_INSTRUCTIONS;
+    let controller = Controller { tick_instructions, ..usual };
     Scenario { seconds, controller, ..Scenario::random(16.0) }
 }
 

@@ -174,9 +174,10 @@ impl<const WRITE: usize, const ERASE: usize> ReadNorFlash for Seen<'_, WRITE, ER
                 bytes[(at - offset) as usize..][..kept.len()].copy_from_slice(kept);
             }
         }
-        if mutation == Mutation::NoCommitMark && within == 0 && bytes.len() > 96 {
-            let word = mark(b"CMIT", &bytes[..64]);
-            bytes[64..72].copy_from_slice(&word);
+        if mutation == Mutation::NoCommitMark && within == 64 {
+            let mut header = [0; 64];
+            self.region.read(slot, &mut header)?;
+            bytes[..8].copy_from_slice(&mark(b"CMIT", &header));
         }
         if mutation.blind_hash() && within >= PAYLOAD_OFFSET {
             let mut hash = [0; 32];

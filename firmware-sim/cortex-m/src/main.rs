@@ -6,7 +6,8 @@
 //!
 //! Without an argument the blobs of `models/` are measured, which are part of the image. The
 //! semihosting argument names a file of other blobs, each behind its length (u32, little-endian).
-//! A line per blob comes out: its place, its robot, instructions of a step, bytes of the blob.
+//! Two lines with a `#` come out, sizes and what an update costs, and a line per blob: its place, its robot,
+//! instructions of a step, bytes of the blob.
 #![no_std]
 #![no_main]
 
@@ -17,6 +18,9 @@ use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m_rt::entry;
 use cortex_m_semihosting::{debug, hprintln};
 use firmware_core::blob::{Aligned, parse, self_test};
+use firmware_core::link::{MAX_FRAME, Message, Received, Receiver, encode};
+use firmware_core::slots::sha256;
+use firmware_core::update::{Ask, MAX_CHUNK, PublicKey, Request, Trust};
 use firmware_core::{Model, Predictor, PredictorState};
 
 mod host;
@@ -25,6 +29,17 @@ mod host;
 const REPETITIONS: u32 = 1_000;
 /// Rounds of the loop that calibrates, of two instructions each.
 const CALIBRATION: u32 = 1_000_000;
+/// A public key, and the signature of 64 zeros by its owner, whose seed is 32 times 1.
+const KEY: [u8; 32] = [
+    138, 136, 227, 221, 116, 9, 241, 149, 253, 82, 219, 45, 60, 186, 93, 114, 202, 103, 9, 191, 29,
+    148, 18, 27, 243, 116, 136, 1, 180, 15, 111, 92,
+];
+const SIGNED: [u8; 64] = [
+    133, 156, 78, 248, 219, 176, 51, 136, 98, 139, 41, 101, 68, 11, 201, 123, 193, 49, 172, 233, 7,
+    234, 110, 7, 145, 108, 149, 106, 115, 211, 75, 213, 234, 144, 164, 175, 219, 174, 249, 249,
+    116, 70, 84, 239, 74, 162, 89, 186, 224, 192, 153, 64, 46, 59, 173, 24, 48, 182, 48, 59, 28,
+    180, 240, 2,
+];
 /// Room for the largest blob that is read from the host.
 const ROOM: usize = 48 * 1024;
 
@@ -68,6 +83,7 @@ fn measure() -> Option<()> {
         size_of::<PredictorState>(),
         per_tick
     );
+    update(per_tick)?;
     let mut name = [0; 256];
     let Some(mut list) = host::list(&mut name).and_then(host::File::open) else {
         for (i, blob) in MODELS.iter().enumerate() {
@@ -87,6 +103,39 @@ fn measure() -> Option<()> {
         i += 1;
     }
     Some(())
+}
+
+/// What it takes to install a model: a signature, and per byte of the largest blob its hash, its parser with
+/// the self-test, and the line.
+#[inline(never)]
+fn update(per_tick: f32) -> Option<()> {
+    let mut good = true;
+    let signature =
+        count(|| good &= black_box(PublicKey(KEY)).accepts(black_box(&[0; 64]), &SIGNED));
+    let [.., blob] = MODELS;
+    let blob = black_box(&blob.0);
+    let hash = count(|| good &= black_box(sha256(blob)) != [0; 32]);
+    let parsed = count(|| good &= parse(black_box(blob)).is_ok());
+    let bytes = blob.get(..MAX_CHUNK)?.iter().copied().collect();
+    let ask = Ask::Chunk { session: u32::MAX, offset: 1_000, bytes };
+    let mut frame = [0; MAX_FRAME];
+    let length = encode(&Message::Request(Request { number: 1, ask }), &mut frame).ok()?;
+    let mut receiver = Receiver::new();
+    let mut received = 0;
+    let line = count(|| {
+        for byte in black_box(frame.get(..length).unwrap_or(&[])) {
+            received += u32::from(matches!(receiver.push(*byte), Some(Received::Message(_))));
+        }
+    });
+    let per_byte = |ticks: u32, bytes: usize| ticks as f32 * per_tick / bytes as f32;
+    hprintln!(
+        "# signature {:.0}, per byte: hash {:.1}, parse {:.1}, line {:.1}",
+        signature as f32 * per_tick,
+        per_byte(hash, blob.len()),
+        per_byte(parsed, blob.len()),
+        per_byte(line, length)
+    );
+    (good && received == 1).then_some(())
 }
 
 /// Ticks that `work` takes; the timer counts down.
