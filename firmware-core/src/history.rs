@@ -122,7 +122,7 @@ impl<S: Scalar> History<S> {
         if layout.kind(i).absolute_angle() { sin.atan2(cos) } else { x }
     }
 
-    /// The present coordinates in `out`, shape `[states]`: angles in (−π, π] where the model
+    /// The present coordinates in `out`, shape `[states]`: angles in \[−π, π\] where the model
     /// predicts them absolutely, as they came or wrapped after a step otherwise.
     #[inline]
     pub fn coordinates(&self, structure: &Structure<'_>, out: &mut [S]) {

@@ -238,7 +238,7 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     }
 
     /// The present coordinates in `out`, shape `[states]`: measured or predicted, whichever came
-    /// last; predicted angles in (−π, π].
+    /// last; predicted angles in \[−π, π\].
     ///
     /// # Errors
     /// [`PredictError::DimensionMismatch`].

@@ -83,7 +83,8 @@ pub trait Scalar:
     }
     /// [`sin_cos`](Self::sin_cos) of an angle that is wrapped.
     fn sin_cos_within(self) -> (Self, Self);
-    /// The angle of the point `(x, self)`, in (−π, π].
+    /// The angle of the point `(x, self)`, in \[−π, π\]: −π just below the negative axis, where the angle
+    /// rounds to it.
     fn atan2(self, x: Self) -> Self;
     /// One over the square root of a positive number; in `f32` with a relative error of at most
     /// 2.4e-7.

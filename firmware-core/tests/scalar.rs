@@ -109,6 +109,9 @@ fn arc_tangents() {
     assert_eq!(Scalar::atan2(0.0_f32, 1.0), 0.0);
     assert_eq!(Scalar::atan2(0.0_f32, -1.0), std::f32::consts::PI);
     assert_eq!(Scalar::atan2(-0.0_f32, -1.0), std::f32::consts::PI);
+    // Rounded: a prediction may be −π, too.
+    assert_eq!(Scalar::atan2(-1e-9_f32, -1.0), -std::f32::consts::PI);
+    assert_eq!(Scalar::atan2(-1e-18_f64, -1.0), -std::f64::consts::PI);
     assert_eq!(Scalar::atan2(1.0_f32, 0.0), quarter);
     assert_eq!(Scalar::atan2(-1.0_f32, 0.0), -quarter);
 }

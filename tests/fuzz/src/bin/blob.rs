@@ -1,0 +1,39 @@
+//! Any bytes as a blob: as they are, and with their length and checksum put right.
+#![no_main]
+
+use fuzz::model::read;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(
+    init: fuzz::seeds([
+        include_bytes!("../../../../models/rosbot/model.bin").as_slice(),
+        include_bytes!("../../../../models/skid-rosbot/model.bin"),
+        include_bytes!("../../../../models/soft-leg/model.bin"),
+        include_bytes!("../../../../models/two-link-arm/model.bin"),
+    ]),
+    |bytes: &[u8]| {
+        let mut words = vec![0_u32; bytes.len().div_ceil(4)];
+        let copy: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut words)[..bytes.len()];
+        copy.copy_from_slice(bytes);
+        read(copy);
+        let whole = copy.len() / 4 * 4;
+        if repair(&mut copy[..whole]).is_some() {
+            read(&copy[..whole]);
+        }
+    }
+);
+
+/// Makes the length and the checksum fit, as a reader without tables would compute them.
+fn repair(blob: &mut [u8]) -> Option<()> {
+    let length = u32::try_from(blob.len()).ok()?;
+    blob.get_mut(8..12)?.copy_from_slice(&length.to_le_bytes());
+    let mut crc = u32::MAX;
+    for byte in blob.get(..12)?.iter().chain(blob.get(16..)?) {
+        crc ^= u32::from(*byte);
+        for _ in 0..8 {
+            crc = (crc >> 1) ^ (0xEDB8_8320 & (crc & 1).wrapping_neg());
+        }
+    }
+    blob[12..16].copy_from_slice(&(!crc).to_le_bytes());
+    Some(())
+}
