@@ -6,6 +6,7 @@
 
 pub mod link;
 pub mod model;
+pub mod robot;
 
 /// Writes the inputs to start from into the folder that `FUZZ_SEEDS` names; nothing if it names none, as
 /// when one input is tried again.

@@ -3,9 +3,13 @@
 use firmware_core::control_loop::telemetry::Frame;
 use firmware_core::control_loop::{Alarms, Mode};
 use firmware_core::link::{MAX_FRAME, Message, Received, Receiver, encode};
+use firmware_core::slots::{Release, Which};
+use firmware_core::update::{
+    Answer, Ask, Capacities, Hello, PROTOCOL, Refused, Request, Say, Signature, Trial,
+};
 
-/// A message of each kind, the longest frame included.
-pub fn messages() -> [Message; 6] {
+/// Messages of each kind, the longest ones included.
+pub fn messages() -> Vec<Message> {
     let numbers = || [-0.0, 1.5, f32::NAN, f32::INFINITY, 1e-40, -7.25, 0.1, 1e30].into_iter();
     let full = Frame {
         sequence: u32::MAX,
@@ -25,7 +29,43 @@ pub fn messages() -> [Message; 6] {
     };
     let inputs = Message::Inputs([12.0, -7.0].into_iter().collect());
     let [empty, full] = [Frame::default(), full].map(Message::Frame);
-    [Message::Start, Message::Stop, Message::Reset, inputs, empty, full]
+    let release = Release { length: 988, sha256: [0xA5; 32], sequence: 7, robot: 0x6B9E_3F84 };
+    let signature: Signature = (0..64).collect();
+    let session = u32::MAX;
+    let asks = [
+        Ask::Hello,
+        Ask::Begin { session, release, signature: signature.clone() },
+        Ask::Chunk { session, offset: 192, bytes: (0..=191).collect() },
+        Ask::Verify { session },
+        Ask::Activate { session, signature: signature.clone() },
+        Ask::Confirm { signature: signature.clone() },
+        Ask::Abort { session, signature },
+    ];
+    let hello = Hello {
+        protocol: PROTOCOL,
+        firmware: "firmware 1.2.3".chars().collect(),
+        name: "a robot with a long name".chars().collect(),
+        robot: u32::MAX,
+        mode: Mode::Idle,
+        capacities: Capacities::new::<3, 2>(u32::MAX, u32::MAX),
+        which: Which::B,
+        release,
+        trial: Some(Trial { good: u32::MAX, needed: u32::MAX }),
+        floor: u32::MAX,
+        key: Some([0xFF; 8]),
+    };
+    let says = [
+        Say::Hello(hello),
+        Say::Working { most_ms: 8_000 },
+        Say::Written { written: 384 },
+        Say::Verified,
+        Say::Refused(Refused::Busy),
+        Say::Refused(Refused::TooEarly { good: 1, needed: 2 }),
+    ];
+    let requests = asks.map(|ask| Message::Request(Request { number: 9, ask }));
+    let answers = says.map(|say| Message::Answer(Answer { number: 9, say }));
+    let others = [Message::Start, Message::Stop, Message::Reset, inputs, empty, full];
+    others.into_iter().chain(requests).chain(answers).collect()
 }
 
 /// The postcard of a message: equal for two of them exactly if they are equal to the bit, NaN included.

@@ -4,7 +4,9 @@
 use crc::{CRC_32_ISO_HDLC, Crc};
 use firmware_core::control_loop::Command;
 use firmware_core::link::{MAX_FRAME, Message, Port, Received};
+use firmware_core::update::NoUpdates;
 use fuzz::link;
+use fuzz::robot::Robot;
 use libfuzzer_sys::fuzz_target;
 
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
@@ -46,25 +48,27 @@ fn pieces(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
     bytes.split(|byte| *byte == 0).filter(|piece| !piece.is_empty())
 }
 
-/// The controller's end takes the same commands and drops everything else.
+/// The controller's end takes the same commands, and counts what is none and no request.
 fn port(mut bytes: &[u8], received: &[Received]) {
-    let (mut port, mut commands) = (Port::new(), Vec::new());
+    let (mut port, mut robot) = (Port::new(), Robot::default());
     while !bytes.is_empty() {
         let before = bytes.len();
-        port.receive::<2>(&mut bytes, |command| commands.push(Message::from(command)));
+        port.receive(&mut bytes, &mut robot, &mut NoUpdates, 0);
         assert!(bytes.len() < before, "the port does not read");
     }
     let expected: Vec<Command<2>> = received
         .iter()
         .filter_map(|received| match received {
             Received::Message(message) => message.command(),
-            Received::Damaged => None,
+            _ => None,
         })
         .collect();
-    assert_eq!(port.damaged() as usize, received.len() - expected.len());
-    let bits = |message: Message| link::bytes(&message);
-    let commands: Vec<_> = commands.into_iter().map(bits).collect();
-    assert_eq!(commands, expected.into_iter().map(|c| bits(c.into())).collect::<Vec<_>>());
+    let is_request = |r: &&Received| matches!(r, Received::Message(Message::Request(_)));
+    let requests = received.iter().filter(is_request).count();
+    assert_eq!(port.damaged() as usize, received.len() - expected.len() - requests);
+    let bits = |command: &Command<2>| link::bytes(&(*command).into());
+    let commands: Vec<_> = robot.commands.iter().map(bits).collect();
+    assert_eq!(commands, expected.iter().map(bits).collect::<Vec<_>>());
 }
 
 /// Bytes whose checksum is right are a message exactly if postcard reads them, to the last one.
@@ -82,7 +86,10 @@ fn in_a_frame(payload: &[u8]) {
             assert_eq!(link::bytes(received), link::bytes(&message));
             assert!(link::frame(received).len() <= frame.len());
         }
-        (Received::Damaged, None) => {}
+        (Received::Unknown { variant, .. }, None) => {
+            assert_eq!(*variant, payload.first().copied().unwrap_or(0));
+        }
+        (Received::TooLong, _) => assert!(frame.len() > MAX_FRAME),
         (received, message) => panic!("{received:?} of {message:?} in {} bytes", frame.len()),
     }
 }
