@@ -1,0 +1,269 @@
+//! Models on their way to a controller that runs its loop: how long it takes, what noise does, what an erase
+//! of seconds does, and that the robot ends with the old or the new model whatever happens.
+
+use std::cell::RefCell;
+use std::path::Path;
+use std::rc::Rc;
+
+use embedded_io::{Read, ReadReady, Write};
+use firmware_core::control_loop::Frame;
+use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
+use firmware_core::model::{
+    Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
+};
+use firmware_core::slots::{PAYLOAD_OFFSET, Which};
+use firmware_core::blob;
+use firmware_sim::mcu::UartEnd;
+use firmware_sim::run::host::{Counts, Laptop};
+use firmware_sim::run::scenario::{LineSettings, Scenario};
+use firmware_sim::run::store::Store;
+use firmware_sim::run::summary::Summary;
+use firmware_sim::run::{Blob, run_with};
+use trainer::flash::{FlashError, Flashing, Options, Outcome, Phase};
+
+/// Bytes of a slot of the simulated controller.
+const SLOT: usize = 128 * 1024;
+
+fn factory() -> Blob {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models");
+    Blob::read(&models.join("skid-rosbot/model.bin")).unwrap()
+}
+
+/// A dense model of the ROSbot with Hermite orders of its four inputs, present and before.
+fn dense(orders: [u8; 4]) -> Blob {
+    let state = |name, unit, space| State {
+        name,
+        unit,
+        space,
+        target: Target::Increment,
+        limit: [f32::MIN, f32::MAX],
+    };
+    let input = |name| Input { name, unit: "rad/s", range: [-16.0, 16.0] };
+    let inputs = [(0, 0), (1, 0), (0, 1), (1, 1)];
+    let factors = (0..4).zip(orders);
+    let structure = Structure::try_from(ModelRepr {
+        robot: "skid-rosbot",
+        sample_time_s: 0.1,
+        states: [
+            state("x", "m", Space::Line),
+            state("y", "m", Space::Line),
+            state("phi", "rad", Space::Circle),
+        ]
+        .into_iter()
+        .collect(),
+        inputs: [input("omega_r"), input("omega_l")].into_iter().collect(),
+        symmetry: Symmetry::Se2 { x: 0, y: 1, heading: 2 },
+        observables: inputs
+            .map(|(i, lag)| Observable { source: Source::Input(i), lag, centre: 0.0, gain: 0.05 })
+            .into_iter()
+            .collect(),
+        factors: factors
+            .map(|(observable, order)| Factor { observable, basis: Basis::Hermite, order })
+            .collect(),
+        blocks: [Block { factors: 4, max_degree: 0 }].into_iter().collect(),
+        provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+    })
+    .unwrap();
+    let terms = structure.dictionary().dense_terms();
+    // Small, and different from each other.
+    let coefficients: Vec<f32> = (0..3 * terms).map(|i| (i % 251) as f32 * 1e-7).collect();
+    let model = Model::new(structure, &coefficients, None).unwrap();
+    let mut out = vec![0; 1 << 16];
+    let length = blob::emit(&model, &[0.0; 6], &[1.0; 4], &[1e-3; 3], &mut out).unwrap();
+    Blob::new(&out[..length])
+}
+
+/// The trainer at the other end of the line.
+struct Installer<'m> {
+    end: UartEnd,
+    flashing: Flashing<'m>,
+    outgoing: Vec<u8>,
+    seen: Rc<RefCell<Seen>>,
+}
+
+#[derive(Clone, Debug, Default)]
+struct Seen {
+    /// Every phase with the time at which it began (µs).
+    phases: Vec<(u64, Phase)>,
+    result: Option<Result<Outcome, FlashError>>,
+}
+
+impl Seen {
+    /// When a phase began (µs).
+    fn at(&self, wanted: Phase) -> u64 {
+        self.phases.iter().find(|(_, phase)| *phase == wanted).expect("it came so far").0
+    }
+}
+
+impl Laptop for Installer<'_> {
+    fn turn(
+        &mut self,
+        now_us: u64,
+        _: &mut dyn FnMut(&Frame) -> std::io::Result<()>,
+    ) -> std::io::Result<()> {
+        let (mut received, mut bytes) = (Vec::new(), [0; 256]);
+        while matches!(self.end.read_ready(), Ok(true)) {
+            let count = self.end.read(&mut bytes).unwrap_or(0);
+            received.extend(&bytes[..count]);
+        }
+        let mut seen = self.seen.borrow_mut();
+        if seen.result.is_some() {
+            return Ok(());
+        }
+        match self.flashing.poll(now_us, &received, &mut self.outgoing) {
+            Ok(progress) => {
+                if seen.phases.last().is_none_or(|(_, phase)| *phase != progress.phase) {
+                    seen.phases.push((now_us, progress.phase));
+                }
+                if let Phase::Done(outcome) = progress.phase {
+                    seen.result = Some(Ok(outcome));
+                }
+            }
+            Err(error) => seen.result = Some(Err(error)),
+        }
+        let count = self.end.write(&self.outgoing).unwrap_or(0);
+        self.outgoing.drain(..count);
+        Ok(())
+    }
+
+    fn counts(&self) -> Counts {
+        Counts::default()
+    }
+}
+
+/// Installs a blob on a ROSbot at rest, on a line with this noise.
+fn install(
+    store: &mut Store,
+    blob: &Blob,
+    noise: f64,
+    seconds: f64,
+    seed: u64,
+) -> (Seen, Summary) {
+    let factory = factory();
+    let line =
+        LineSettings { loss: noise, doubling: noise, bit_flip: noise, ..LineSettings::default() };
+    let scenario = Scenario { seconds, line, ..Scenario::random(16.0) };
+    let model = blob.model().unwrap();
+    let options = Options { session: seed as u32, baud: Some(576_000), ..Options::default() };
+    let seen = Rc::new(RefCell::new(Seen::default()));
+    let installer = |end| Installer {
+        end,
+        flashing: Flashing::new(blob.bytes(), &model, None, options),
+        outgoing: Vec::new(),
+        seen: seen.clone(),
+    };
+    let summary = run_with(&factory.model().unwrap(), &scenario, seed, store, installer).unwrap();
+    (seen.take(), summary)
+}
+
+/// The slot that begins here holds the whole blob.
+fn holds(store: &Store, slot: usize, blob: &Blob) -> bool {
+    let payload = slot * SLOT + PAYLOAD_OFFSET as usize;
+    store.image[payload..].starts_with(blob.bytes())
+}
+
+#[test]
+fn a_clean_line_takes_as_long_as_its_bytes() {
+    let (small, large) = (factory(), dense([5; 4]));
+    assert!((15_900..16_500).contains(&large.bytes().len()), "{} bytes", large.bytes().len());
+    for (blob, most_s) in [(small, 1.0), (large, 3.0)] {
+        let mut store = Store::new(&factory(), None);
+        let (seen, summary) = install(&mut store, &blob, 0.0, 60.0, 1);
+        assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{:?}", seen.phases);
+        let [asking, erasing, writing, restarting, done] = [
+            seen.phases[0].0,
+            seen.at(Phase::Erasing),
+            seen.at(Phase::Writing),
+            seen.at(Phase::Restarting),
+            seen.at(Phase::Done(Outcome::Installed)),
+        ]
+        .map(|us| us as f64 * 1e-6);
+        let erase = writing - erasing;
+        println!(
+            "{} B at 576,000 baud: {:.3} s from the first question to the reset, without the erase of \
+             {erase:.3} s; {:.2} s in all with the trial",
+            blob.bytes().len(),
+            restarting - asking - erase,
+            done - asking
+        );
+        assert!(restarting - asking - erase < most_s);
+        // As the data sheet says of a sector of 128 KB.
+        assert!((1.0..1.1).contains(&erase), "{erase} s");
+        assert!(holds(&store, 0, &blob));
+        let boots: Vec<_> = store.boots.iter().map(|b| (b.running, b.trial)).collect();
+        assert_eq!(boots, [(Which::Factory, false), (Which::A, true)]);
+        assert_eq!((summary.deadline_misses, summary.driven_at_rest), (0, 0));
+        // It stays.
+        install(&mut store, &blob, 0.0, 1.0, 1);
+        let last = store.boots.last().unwrap();
+        assert_eq!((last.running, last.trial), (Which::A, false));
+    }
+}
+
+#[test]
+fn the_session_lives_through_an_erase_of_four_seconds() {
+    let mut store = Store::new(&factory(), None);
+    store.erase_ns = Some(4_000_000_000);
+    let blob = dense([3, 3, 3, 4]);
+    let (seen, _) = install(&mut store, &blob, 0.0, 60.0, 1);
+    assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{:?}", seen.phases);
+    let erase = seen.at(Phase::Writing) - seen.at(Phase::Erasing);
+    assert!((4_000_000..4_100_000).contains(&erase), "{erase} µs");
+    // Once: it did not begin again.
+    assert_eq!(seen.phases.iter().filter(|(_, phase)| *phase == Phase::Erasing).count(), 1);
+}
+
+#[test]
+fn a_model_of_four_kilobytes_arrives_on_a_noisy_line() {
+    let blob = dense([3, 3, 3, 4]);
+    assert!((4_000..4_400).contains(&blob.bytes().len()), "{} bytes", blob.bytes().len());
+    let mut times: Vec<f64> = (1..=100)
+        .map(|seed| {
+            let mut store = Store::new(&factory(), None);
+            let (seen, summary) = install(&mut store, &blob, 1e-3, 120.0, seed);
+            assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "seed {seed}: {:?}", seen.phases);
+            assert!(holds(&store, 0, &blob), "seed {seed}");
+            assert_eq!(summary.driven_at_rest, 0);
+            (seen.at(Phase::Restarting) - seen.phases[0].0) as f64 * 1e-6
+        })
+        .collect();
+    times.sort_by(f64::total_cmp);
+    println!(
+        "each byte lost, doubled, flipped with 1e-3 each: 100 of 100 arrive, after {:.1} to {:.1} s, median \
+         {:.1} s, the erase of 1 s included",
+        times[0], times[99], times[50]
+    );
+}
+
+#[test]
+fn on_a_very_noisy_line_it_arrives_or_says_why_not() {
+    let blob = dense([3, 3, 3, 4]);
+    let (mut times, mut failed) = (Vec::new(), 0);
+    for seed in 1..=30 {
+        let mut store = Store::new(&factory(), None);
+        let (seen, _) = install(&mut store, &blob, 1e-2, 600.0, seed);
+        let (booted, last) = (store.boots.len(), *store.boots.last().unwrap());
+        match seen.result.clone().expect("it ends") {
+            Ok(outcome) => {
+                assert_eq!((outcome, booted), (Outcome::Installed, 2), "seed {seed}");
+                times.push((seen.at(Phase::Restarting) - seen.phases[0].0) as f64 * 1e-6);
+            }
+            Err(error) => {
+                failed += 1;
+                println!("seed {seed}: {error}");
+            }
+        }
+        // Whatever was heard: the controller runs the old or the new model, whole.
+        match last.running {
+            Which::Factory => {}
+            _ => assert!(holds(&store, 0, &blob), "seed {seed}: half a model runs"),
+        }
+    }
+    times.sort_by(f64::total_cmp);
+    println!(
+        "with 1e-2 each: {} of 30 arrive, after {:.1} to {:.1} s, {failed} end with an error",
+        times.len(),
+        times.first().copied().unwrap_or(f64::NAN),
+        times.last().copied().unwrap_or(f64::NAN)
+    );
+}
