@@ -19,6 +19,7 @@
 //! | [`report`], [`inspect`], [`spectrum_report`], [`terms`] | what the commands print |
 //! | [`topology`] | lifting functions of a topology, as in the paper's table |
 //! | [`monitor`] | a controller's telemetry, live and recorded |
+//! | [`signing`] | keys, and signed releases of models |
 //! | [`resample`] | logs on a regular time grid |
 
 pub mod arx;
@@ -51,6 +52,7 @@ pub mod rollout;
 pub mod score;
 pub mod select;
 mod select_report;
+pub mod signing;
 pub mod sindy;
 pub mod snapshots;
 pub mod solve;
