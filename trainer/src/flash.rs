@@ -202,7 +202,7 @@ fn misfit(Misfit { field, expected, found, .. }: &Misfit) -> String {
         |option: &str| format!("`trainer select --{option} {expected}` finds one that fits");
     match *field {
         "sample time in µs" => {
-            let [expected, found] = [expected, found].map(|us| *us as f64 * 1e-6);
+            let [expected, found] = [expected, found].map(|us| *us as f64 / 1e6);
             format!(
                 "its sample time is {found} s, that of the controller {expected} s; fit it with \
                  `sample_time_s = {expected}`"
