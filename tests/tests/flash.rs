@@ -29,8 +29,8 @@ use trainer::exchange::Counts;
 use trainer::flash::{FlashError, Flashing, Options, Outcome, PATIENCE_US, Phase};
 use trainer::signing::{SecretKey, SignedRelease};
 
-/// Time of a byte at 576,000 baud (ns).
-const BYTE_NS: u64 = 10 * 1_000_000_000 / 576_000;
+/// Bits per second of the line, ten of them to a byte.
+const BAUD: u32 = 576_000;
 /// What the controller's receiver keeps while nobody reads it, as a DMA buffer does (bytes).
 const BUFFER: usize = 512;
 const TICK_US: u64 = 10_000;
@@ -83,6 +83,8 @@ struct Line {
     on_the_way: VecDeque<(u64, u8)>,
     /// When the last byte has passed (ns).
     free_ns: u64,
+    /// Time of a byte (ns).
+    byte_ns: u64,
     noise: f64,
     cut: bool,
     rng: ChaCha8Rng,
@@ -91,12 +93,23 @@ struct Line {
 impl Line {
     fn new(noise: f64, seed: u64) -> Self {
         let rng = ChaCha8Rng::seed_from_u64(seed);
-        Self { on_the_way: VecDeque::new(), free_ns: 0, noise, cut: false, rng }
+        Self {
+            on_the_way: VecDeque::new(),
+            free_ns: 0,
+            byte_ns: 10_000_000_000 / u64::from(BAUD),
+            noise,
+            cut: false,
+            rng,
+        }
+    }
+
+    fn at(baud: u32) -> Self {
+        Self { byte_ns: 10_000_000_000 / u64::from(baud), ..Self::new(0.0, 0) }
     }
 
     fn send(&mut self, bytes: &[u8], now_ns: u64) {
         for byte in bytes {
-            self.free_ns = self.free_ns.max(now_ns) + BYTE_NS;
+            self.free_ns = self.free_ns.max(now_ns) + self.byte_ns;
             let mut happens = || self.noise > 0.0 && self.rng.random_bool(self.noise);
             let (lost, doubled, flipped) = (happens(), happens(), happens());
             let flip = if flipped { 1 << self.rng.random_range(0..8_u32) } else { 0 };
@@ -157,7 +170,7 @@ impl Write for Serial<'_> {
 impl WriteReady for Serial<'_> {
     /// A byte is on the way, and there is room for one more.
     fn write_ready(&mut self) -> Result<bool, Infallible> {
-        Ok(self.line.free_ns <= self.now_ns + BYTE_NS)
+        Ok(self.line.free_ns <= self.now_ns + self.line.byte_ns)
     }
 }
 
@@ -473,7 +486,7 @@ fn sign(blob: &Blob, sequence: u32, key: &SecretKey) -> SignedRelease {
 }
 
 fn options(session: u32) -> Options {
-    Options { session, baud: Some(576_000), ..Options::default() }
+    Options { session, baud: Some(BAUD), ..Options::default() }
 }
 
 /// An update over a line with noise, from the factory model.
@@ -573,6 +586,7 @@ fn four_kilobytes_arrive_over_a_bad_line() {
         assert!(place.runs().0 == blob.bytes(), "seed {seed}");
         all.push(went);
     }
+    report("4 KB over a clean line", &[update(&blob, 0.0, 0).0]);
     report("4 KB, 0.1 % of the bytes each lost, doubled, flipped", &all);
 }
 
@@ -609,6 +623,29 @@ fn over_a_terrible_line_the_old_or_the_new_model_runs() {
 #[ignore = "takes 20 s"]
 fn over_a_terrible_line_a_thousand_times() {
     assert!(over_a_terrible_line(1000..2000) >= 990);
+}
+
+/// A line a sixtieth as fast, half of it taken by telemetry: whether its speed is known or not, requests
+/// are not repeated before their answers can have come.
+#[test]
+fn a_slow_line_is_not_flooded() {
+    let blob = Blob::read("rosbot");
+    let owner = key(1);
+    let (model, signed) = (blob.model(), sign(&blob, 3, &owner));
+    for (baud, most_repeated) in [(Some(9600), 3), (None, 12)] {
+        let place = Place::new(&blob, Some(owner.public()));
+        let mut queue = Queue::new();
+        let mut controller = Controller::new(&place, &mut queue);
+        let options = Options { baud, ..options(1) };
+        let flashing = Flashing::new(blob.bytes(), &model, Some(&signed), options);
+        let lines = [&mut Line::at(9600), &mut Line::at(9600)];
+        let went = flash(&mut controller, lines, flashing, &mut |_, _, _| {});
+        assert_eq!(went.result, Ok(Outcome::Installed), "{baud:?}: {went:?}");
+        drop(controller);
+        assert!(place.runs().0 == blob.bytes());
+        println!("9,600 baud, {baud:?}: {:.2} s, {:?}", seconds(went.us), went.counts);
+        assert!(went.counts.repeated <= most_repeated, "{baud:?}: {went:?}");
+    }
 }
 
 #[test]

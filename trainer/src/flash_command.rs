@@ -79,7 +79,7 @@ fn run(
         };
         match line.write_all(&out).and_then(|()| line.read_within(&mut bytes, patience)) {
             Ok(read) => count = read,
-            Err(_) if phase == Phase::Restarting => port = None,
+            Err(_) if matches!(phase, Phase::Activating | Phase::Restarting) => port = None,
             Err(e) if written == 0 => return Err(failed(&e)),
             Err(e) => {
                 return Err(failed(&format!("{e}; the same command goes on at byte {written}")));
