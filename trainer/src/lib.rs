@@ -18,7 +18,10 @@
 //! | [`reproduce`], [`convergence`], [`figures`], [`plot`] | the paper's experiments, tables and figures |
 //! | [`report`], [`inspect`], [`spectrum_report`], [`terms`] | what the commands print |
 //! | [`topology`] | lifting functions of a topology, as in the paper's table |
+//! | [`port`] | the line to a controller |
+//! | [`flash`], [`exchange`] | installing a model on a controller; requests that are repeated until answered |
 //! | [`monitor`] | a controller's telemetry, live and recorded |
+//! | [`signing`] | keys, and signed releases of models |
 //! | [`resample`] | logs on a regular time grid |
 
 pub mod arx;
@@ -28,8 +31,10 @@ pub mod convergence;
 pub mod cross_conformal;
 pub mod edmd;
 pub mod edmd_dl;
+pub mod exchange;
 pub mod export;
 pub mod figures;
+pub mod flash;
 pub mod forecast;
 pub mod full_operator;
 pub mod gram;
@@ -41,6 +46,7 @@ pub mod monitor;
 mod paper;
 mod paper_report;
 pub mod plot;
+pub mod port;
 pub mod recording;
 pub mod refine;
 pub mod report;
@@ -51,6 +57,7 @@ pub mod rollout;
 pub mod score;
 pub mod select;
 mod select_report;
+pub mod signing;
 pub mod sindy;
 pub mod snapshots;
 pub mod solve;

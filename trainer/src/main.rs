@@ -1,5 +1,7 @@
 //! The command `trainer`: logs in, a model for the controller out.
 
+mod flash_command;
+
 use std::fmt::Display;
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -18,7 +20,8 @@ use trainer::export::{controller_coefficients, export, write_whole};
 use trainer::figures;
 use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
-use trainer::monitor::{Port, Recorder, listen, picture};
+use trainer::monitor::{Recorder, listen, picture};
+use trainer::port::Port;
 use trainer::recording::{LogColumn, LogSchema, Recording};
 use trainer::report::{ScoreReport, grouped, hexadecimal, significant};
 use trainer::reproduce::{self, Method as PaperMethod, Reproduction};
@@ -27,6 +30,7 @@ use trainer::robot::{Method, Robot, ScoreOptions};
 use trainer::rollout::TestReport;
 use trainer::score::{self, Counts, Lifted};
 use trainer::select::{self, Budget};
+use trainer::signing::{SecretKey, SignedRelease, rust_line};
 use trainer::spectrum_report::SpectrumReport;
 use trainer::stability::Stability;
 use trainer::topology::{Orders, lifting};
@@ -53,6 +57,9 @@ enum Command {
     Resample(ResampleArgs),
     Reproduce(ReproduceArgs),
     Monitor(MonitorArgs),
+    Keygen(KeygenArgs),
+    Sign(SignArgs),
+    Flash(FlashArgs),
 }
 
 /// Fit the model of a robot to its logs, score it on held-out trajectories, and write the blob.
@@ -326,6 +333,59 @@ struct MonitorArgs {
     baud: u32,
 }
 
+/// Make a pair of keys: whose models a controller installs.
+///
+/// Prints the public key as the firmware takes it. The secret one signs models; keep it off the robots,
+/// and keep a copy: it is not to be had again.
+#[derive(Args)]
+struct KeygenArgs {
+    /// Name of the new files: NAME.key and NAME.pub.
+    #[arg(long, value_name = "NAME")]
+    out: PathBuf,
+}
+
+/// Sign a model, so that a controller which trusts the key installs it.
+#[derive(Args)]
+struct SignArgs {
+    /// The blob.
+    model: PathBuf,
+    /// The secret key, NAME.key of `keygen`.
+    #[arg(long, value_name = "FILE")]
+    key: PathBuf,
+    /// Number of the release. A controller installs none with a smaller number than it has confirmed.
+    #[arg(long, value_name = "N")]
+    sequence: u32,
+    /// Where the signatures are written [default: MODEL.sig beside the model].
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+/// Install a model on a controller, over the line, without its firmware.
+///
+/// The robot has to be at rest. The model runs on trial first, and is kept when enough ticks in a row were
+/// good; otherwise the next restart goes back to the model before. An update that was interrupted goes
+/// on where it stopped when the same command is run again.
+#[derive(Args)]
+struct FlashArgs {
+    /// The blob.
+    model: PathBuf,
+    /// Serial device, pseudo-terminal, or tcp:HOST:PORT.
+    #[arg(long, value_name = "PORT")]
+    port: String,
+    /// Bits per second of a serial device.
+    #[arg(long, value_name = "N", default_value_t = 576_000, value_parser = clap::value_parser!(u32).range(300..=20_000_000))]
+    baud: u32,
+    /// The signatures of the model, by `sign` [default: MODEL.sig beside it, if that is there].
+    #[arg(long, value_name = "FILE")]
+    signature: Option<PathBuf>,
+    /// Only tell who is there, and whether the model could be installed.
+    #[arg(long)]
+    dry_run: bool,
+    /// Stop when the model runs on trial: the same command without this confirms it.
+    #[arg(long)]
+    trial: bool,
+}
+
 /// A message for the user.
 struct Failure(String);
 
@@ -348,6 +408,9 @@ fn main() -> ExitCode {
         Command::Dictionary(args) => dictionary(&args),
         Command::Resample(args) => resample_logs(&args),
         Command::Reproduce(args) => reproduce_paper(&args),
+        Command::Keygen(args) => keygen(&args),
+        Command::Sign(args) => sign(&args),
+        Command::Flash(args) => flash_command::flash(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -923,6 +986,47 @@ fn calibrate(args: &CalibrateArgs) -> Result<(), Failure> {
         Some(Ok(None)) | None => {}
     }
     print(&text)
+}
+
+fn keygen(args: &KeygenArgs) -> Result<(), Failure> {
+    let key = SecretKey::generate()?;
+    let (secret, public) = key.write(&args.out)?;
+    print(&format!(
+        "{}: secret, signs models; keep it off the robots\n{}: public\n\n{}\n\n\
+         A controller with this key says that it begins {}\n",
+        secret.display(),
+        public.display(),
+        rust_line(&key.public()),
+        hexadecimal(&key.public().0[..8])
+    ))
+}
+
+fn sign(args: &SignArgs) -> Result<(), Failure> {
+    let file = BlobFile::read(&args.model)?;
+    let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let key = SecretKey::read(&args.key)?;
+    let out = args.out.clone().unwrap_or_else(|| args.model.with_extension("sig"));
+    let found = out.canonicalize().ok();
+    for (taken, what) in [(&args.model, "model"), (&args.key, "secret key")] {
+        if found.is_some() && taken.canonicalize().ok() == found {
+            return Err(Failure(format!(
+                "{}: the {what} would be replaced by its signatures; give another --out",
+                out.display()
+            )));
+        }
+    }
+    let robot = model.structure().robot();
+    let signed = SignedRelease::new(&key, robot, args.sequence, file.bytes());
+    let signed = signed.ok_or_else(|| format!("{}: too long", args.model.display()))?;
+    write_whole(&out, |file| file.write_all(signed.text().as_bytes()))?;
+    print(&format!(
+        "{}: {}, {} bytes, as release {} for `{robot}`, signed with the key that begins {}\n",
+        out.display(),
+        args.model.display(),
+        grouped(file.bytes().len() as u64),
+        args.sequence,
+        hexadecimal(&key.public().0[..8])
+    ))
 }
 
 fn monitor(args: &MonitorArgs) -> Result<(), Failure> {

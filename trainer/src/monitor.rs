@@ -1,85 +1,16 @@
 //! Listening to a controller: its telemetry, live, and recorded as logs.
 
-use std::io::{self, ErrorKind, Read, Write};
-use std::net::{TcpStream, ToSocketAddrs};
+use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use firmware_core::control_loop::Frame;
 use firmware_core::control_loop::telemetry::Rows;
 use firmware_core::link::{Message, Received, Receiver};
-use serial2::SerialPort;
 
+use crate::port::Port;
 use crate::recording::unit_suffix;
 use crate::robot::Robot;
-
-/// Longest wait for bytes: after it a caller may look at the clock.
-const PATIENCE: Duration = Duration::from_millis(100);
-
-/// Why a port cannot be listened to.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum PortError {
-    /// An address that is none.
-    #[error("{port}: expected a serial device, or tcp:HOST:PORT")]
-    Address {
-        /// What was given.
-        port: String,
-    },
-    /// It cannot be opened.
-    #[error("{port}: cannot be opened: {error}")]
-    Open {
-        /// What was given.
-        port: String,
-        /// Why.
-        error: io::Error,
-    },
-}
-
-/// A line to a controller.
-#[derive(Debug)]
-pub enum Port {
-    /// A serial device, or a pseudo-terminal.
-    Serial(SerialPort),
-    /// A TCP connection.
-    Tcp(TcpStream),
-}
-
-impl Port {
-    /// Opens `tcp:HOST:PORT`, or the serial device of this name at `baud` bits/s.
-    ///
-    /// # Errors
-    /// [`PortError`].
-    pub fn open(port: &str, baud: u32) -> Result<Self, PortError> {
-        let open = |error| PortError::Open { port: port.to_owned(), error };
-        let Some(address) = port.strip_prefix("tcp:") else {
-            let mut line = SerialPort::open(port, baud).map_err(open)?;
-            line.set_read_timeout(PATIENCE).map_err(open)?;
-            return Ok(Self::Serial(line));
-        };
-        let address = address.to_socket_addrs().ok().and_then(|mut found| found.next());
-        let address = address.ok_or_else(|| PortError::Address { port: port.to_owned() })?;
-        let stream = TcpStream::connect_timeout(&address, Duration::from_secs(5)).map_err(open)?;
-        stream.set_read_timeout(Some(PATIENCE)).map_err(open)?;
-        Ok(Self::Tcp(stream))
-    }
-
-    /// What has arrived; nothing after a tenth of a second without a byte.
-    ///
-    /// # Errors
-    /// When the line is gone.
-    pub fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
-        let read = match self {
-            Self::Serial(line) => line.read(bytes),
-            Self::Tcp(stream) => stream.read(bytes),
-        };
-        match read {
-            Ok(0) => Err(io::Error::new(ErrorKind::UnexpectedEof, "the other end has hung up")),
-            Err(e) if [ErrorKind::TimedOut, ErrorKind::WouldBlock].contains(&e.kind()) => Ok(0),
-            read => read,
-        }
-    }
-}
 
 /// Telemetry as logs: `episode-000.csv`, … in a folder, a new one at every gap. Every row is on the disk
 /// before the next one comes.

@@ -327,6 +327,13 @@ pub struct Robot {
     pub sha256: [u8; 32],
 }
 
+/// Where a TOML file is wrong, from 1.
+pub(crate) fn line_and_column(text: &str, error: &toml::de::Error) -> (usize, usize) {
+    let before = &text[..error.span().map_or(0, |span| span.start.min(text.len()))];
+    let line_start = before.rfind('\n').map_or(0, |i| i + 1);
+    (before.matches('\n').count() + 1, before[line_start..].chars().count() + 1)
+}
+
 impl Robot {
     /// Reads `robot.toml`, or the one in a folder.
     ///
@@ -345,14 +352,9 @@ impl Robot {
     /// As [`load`](Self::load).
     pub fn parse(text: &str, path: &Path) -> Result<Self, RobotError> {
         let toml: RobotToml = toml::from_str(text).map_err(|error| {
-            let before = &text[..error.span().map_or(0, |span| span.start.min(text.len()))];
-            let line_start = before.rfind('\n').map_or(0, |i| i + 1);
-            RobotError::Syntax {
-                path: path.to_owned(),
-                line: before.matches('\n').count() + 1,
-                column: before[line_start..].chars().count() + 1,
-                message: error.message().trim().replace('\n', " "),
-            }
+            let (line, column) = line_and_column(text, &error);
+            let message = error.message().trim().replace('\n', " ");
+            RobotError::Syntax { path: path.to_owned(), line, column, message }
         })?;
         let sha256 = Sha256::digest(text.as_bytes()).into();
         let mut robot = Self::check(toml, sha256).map_err(|(key, message)| {
