@@ -430,6 +430,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             continue;
         }
         boots += 1;
+        let booted_us = world.now_us();
         let (mut updates, chosen) = match &installed {
             Some(installed) => {
                 let (updater, chosen, booted) = installed.boot();
@@ -438,6 +439,13 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             }
             None => (None, None),
         };
+        if world.now_us() > booted_us {
+            // The timer of the ticks starts when everything else is ready.
+            world.leave_out(Mode::Idle);
+            if !world.next_tick(model)? {
+                continue;
+            }
+        }
         let parsed = chosen.as_ref().map(Blob::model).transpose()?;
         let model = parsed.as_ref().unwrap_or(model);
         let cost_us = cost_us(model);
@@ -452,11 +460,20 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
         loop {
             let mut began_us = world.now_us();
             port.receive(&mut serial, &mut firmware, &mut updates, began_us);
-            if world.now_us() > began_us {
-                // Something of an update was done. Its tick may be over by now.
+            let waited_us = world.now_us() - began_us;
+            if waited_us > R::TICK_US / 4 {
+                // Something of an update took long: this tick is left out, and what else was due.
+                world.summary.left_out(firmware.mode(), 1);
                 world.leave_out(firmware.mode());
-                began_us = world.now_us();
+                if world.tick >= ticks {
+                    break 'boots;
+                }
+                if !world.next_tick(model)? {
+                    break;
+                }
+                continue;
             }
+            began_us += waited_us;
             let is_sample = of_boot % R::TICKS_PER_SAMPLE == 0;
             // While the model's history fills there is nothing to predict.
             let predicts = is_sample && of_boot / R::TICKS_PER_SAMPLE >= lag;

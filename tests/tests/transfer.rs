@@ -6,13 +6,13 @@ use std::path::Path;
 use std::rc::Rc;
 
 use embedded_io::{Read, ReadReady, Write};
+use firmware_core::blob;
 use firmware_core::control_loop::Frame;
 use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
 use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
 use firmware_core::slots::{PAYLOAD_OFFSET, Which};
-use firmware_core::blob;
 use firmware_sim::mcu::UartEnd;
 use firmware_sim::run::host::{Counts, Laptop};
 use firmware_sim::run::scenario::{LineSettings, Scenario};
@@ -24,9 +24,9 @@ use trainer::flash::{FlashError, Flashing, Options, Outcome, Phase};
 /// Bytes of a slot of the simulated controller.
 const SLOT: usize = 128 * 1024;
 
+/// The model in the image.
 fn factory() -> Blob {
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models");
-    Blob::read(&models.join("skid-rosbot/model.bin")).unwrap()
+    dense([1; 4])
 }
 
 /// A dense model of the ROSbot with Hermite orders of its four inputs, present and before.
@@ -132,13 +132,7 @@ impl Laptop for Installer<'_> {
 }
 
 /// Installs a blob on a ROSbot at rest, on a line with this noise.
-fn install(
-    store: &mut Store,
-    blob: &Blob,
-    noise: f64,
-    seconds: f64,
-    seed: u64,
-) -> (Seen, Summary) {
+fn install(store: &mut Store, blob: &Blob, noise: f64, seconds: f64, seed: u64) -> (Seen, Summary) {
     let factory = factory();
     let line =
         LineSettings { loss: noise, doubling: noise, bit_flip: noise, ..LineSettings::default() };
@@ -164,7 +158,9 @@ fn holds(store: &Store, slot: usize, blob: &Blob) -> bool {
 
 #[test]
 fn a_clean_line_takes_as_long_as_its_bytes() {
-    let (small, large) = (factory(), dense([5; 4]));
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models");
+    let small = Blob::read(&models.join("skid-rosbot/model.bin")).unwrap();
+    let large = dense([5; 4]);
     assert!((15_900..16_500).contains(&large.bytes().len()), "{} bytes", large.bytes().len());
     for (blob, most_s) in [(small, 1.0), (large, 3.0)] {
         let mut store = Store::new(&factory(), None);
