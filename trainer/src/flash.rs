@@ -385,6 +385,23 @@ enum Step {
 }
 
 /// An update under way.
+///
+/// ```
+/// use firmware_core::blob::Aligned;
+/// use trainer::flash::{FlashError, Flashing, Options, Phase};
+///
+/// static BLOB: &Aligned<[u8]> =
+///     &Aligned(*include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/rosbot/model.bin")));
+/// let model = firmware_core::parse(&BLOB.0).unwrap();
+/// let mut flashing = Flashing::new(&BLOB.0, &model, None, Options::default());
+/// let mut line = Vec::new();
+/// let progress = flashing.poll(0, &[], &mut line).unwrap();
+/// assert_eq!((progress.phase, progress.length), (Phase::Asking, 1396));
+/// assert_eq!(line.len(), 9); // Hello
+/// assert_eq!(progress.next_us, 150_000); // or when something arrives
+/// let error = flashing.poll(30_000_000, &[], &mut line).unwrap_err();
+/// assert_eq!(error, FlashError::NoAnswer { frames: false });
+/// ```
 #[derive(Debug)]
 pub struct Flashing<'m> {
     blob: &'m [u8],

@@ -307,7 +307,8 @@ fn boot(flash: &Memory, key: Option<PublicKey>, listener: &TcpListener, end: &At
     listener.set_nonblocking(true).unwrap();
     let mut stream: Option<TcpStream> = None;
     let mut bytes = [0; 512];
-    while !end.load(Ordering::Relaxed) && !(updater.resets() && port.is_sent()) {
+    let mut resets = false;
+    while !(resets || end.load(Ordering::Relaxed)) {
         std::thread::sleep(Duration::from_millis(1));
         if let Ok((new, _)) = listener.accept() {
             new.set_nonblocking(true).unwrap();
@@ -326,6 +327,7 @@ fn boot(flash: &Memory, key: Option<PublicKey>, listener: &TcpListener, end: &At
             let _ = stream.write_all(&serial.sent);
         }
         serial.sent.clear();
+        resets = updater.resets() && port.is_sent();
     }
 }
 
