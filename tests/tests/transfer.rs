@@ -7,8 +7,9 @@ use std::rc::Rc;
 
 use embedded_io::{Read, ReadReady, Write};
 use firmware_core::blob;
-use firmware_core::control_loop::Frame;
+use firmware_core::control_loop::{Command, Frame, Mode};
 use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
+use firmware_core::link::{MAX_FRAME, Message, Received, Receiver, encode};
 use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
@@ -78,6 +79,10 @@ struct Installer<'m> {
     end: UartEnd,
     flashing: Flashing<'m>,
     outgoing: Vec<u8>,
+    /// Drives the robot, too, and starts it whenever it stands.
+    drives: bool,
+    next_us: u64,
+    receiver: Receiver,
     seen: Rc<RefCell<Seen>>,
 }
 
@@ -86,6 +91,8 @@ struct Seen {
     /// Every phase with the time at which it began (µs).
     phases: Vec<(u64, Phase)>,
     result: Option<Result<Outcome, FlashError>>,
+    /// Samples of the running robot, with their times (µs).
+    running_us: Vec<u64>,
 }
 
 impl Seen {
@@ -107,7 +114,24 @@ impl Laptop for Installer<'_> {
             received.extend(&bytes[..count]);
         }
         let mut seen = self.seen.borrow_mut();
+        for byte in &received {
+            if let Some(Received::Message(Message::Frame(frame))) = self.receiver.push(*byte)
+                && frame.mode == Mode::Running
+            {
+                seen.running_us.push(now_us);
+            }
+        }
+        if self.drives && now_us >= self.next_us {
+            self.next_us = now_us + 50_000;
+            for message in [Message::Reset, Message::Start, Command::Inputs([8.0, 6.0]).into()] {
+                let mut frame = [0; MAX_FRAME];
+                let length = encode(&message, &mut frame).unwrap();
+                self.outgoing.extend(&frame[..length]);
+            }
+        }
         if seen.result.is_some() {
+            let count = self.end.write(&self.outgoing).unwrap_or(0);
+            self.outgoing.drain(..count);
             return Ok(());
         }
         match self.flashing.poll(now_us, &received, &mut self.outgoing) {
@@ -133,17 +157,31 @@ impl Laptop for Installer<'_> {
 
 /// Installs a blob on a ROSbot at rest, on a line with this noise.
 fn install(store: &mut Store, blob: &Blob, noise: f64, seconds: f64, seed: u64) -> (Seen, Summary) {
+    let options = Options { session: seed as u32, baud: Some(576_000), ..Options::default() };
+    install_with(store, blob, noise, seconds, (seed, options, false))
+}
+
+/// The same with these options, beside somebody who drives the robot.
+fn install_with(
+    store: &mut Store,
+    blob: &Blob,
+    noise: f64,
+    seconds: f64,
+    (seed, options, drives): (u64, Options, bool),
+) -> (Seen, Summary) {
     let factory = factory();
     let line =
         LineSettings { loss: noise, doubling: noise, bit_flip: noise, ..LineSettings::default() };
     let scenario = Scenario { seconds, line, ..Scenario::random(16.0) };
     let model = blob.model().unwrap();
-    let options = Options { session: seed as u32, baud: Some(576_000), ..Options::default() };
     let seen = Rc::new(RefCell::new(Seen::default()));
     let installer = |end| Installer {
         end,
         flashing: Flashing::new(blob.bytes(), &model, None, options),
         outgoing: Vec::new(),
+        drives,
+        next_us: 1_000_000,
+        receiver: Receiver::new(),
         seen: seen.clone(),
     };
     let summary = run_with(&factory.model().unwrap(), &scenario, seed, store, installer).unwrap();
@@ -194,6 +232,28 @@ fn a_clean_line_takes_as_long_as_its_bytes() {
         let last = store.boots.last().unwrap();
         assert_eq!((last.running, last.trial), (Which::A, false));
     }
+}
+
+#[test]
+fn a_robot_that_somebody_drives_is_stopped_for_it_if_that_is_asked() {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models");
+    let blob = Blob::read(&models.join("skid-rosbot/model.bin")).unwrap();
+    let mut store = Store::new(&factory(), None);
+    let options = Options { session: 1, ..Options::default() };
+    // It begins before anybody drives, and ends where it is to be confirmed.
+    let (seen, _) = install_with(&mut store, &blob, 0.0, 40.0, (1, options, true));
+    assert_eq!(seen.result, Some(Err(FlashError::Running)), "{:?}", seen.phases);
+    assert_eq!(store.boots.len(), 2);
+
+    let mut store = Store::new(&factory(), None);
+    let options = Options { stop: true, ..options };
+    let (seen, summary) = install_with(&mut store, &blob, 0.0, 40.0, (1, options, true));
+    assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{:?}", seen.phases);
+    let confirmed_us = seen.at(Phase::Done(Outcome::Installed));
+    let trial = seen.running_us.iter().filter(|us| (2_000_000..confirmed_us).contains(us)).count();
+    let after = seen.running_us.iter().filter(|us| **us > confirmed_us).count();
+    assert!(trial > 50 && after > 100, "{trial} samples on trial, {after} after it");
+    assert_eq!((summary.deadline_misses, summary.driven_at_rest), (0, 0));
 }
 
 #[test]

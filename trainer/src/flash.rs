@@ -28,6 +28,7 @@
 use std::fmt;
 
 use firmware_core::control_loop::Mode;
+use firmware_core::link::{MAX_FRAME, Message, encode};
 use firmware_core::model::Model;
 use firmware_core::slots::{Release, Which, robot};
 use firmware_core::update::{
@@ -69,6 +70,8 @@ pub struct Options {
     pub dry_run: bool,
     /// Stop when the model runs on trial.
     pub trial: bool,
+    /// Stop a running robot, each time that it is in the way.
+    pub stop: bool,
 }
 
 /// Why a model is not installed.
@@ -172,8 +175,8 @@ pub enum FlashError {
     },
     /// The robot is running.
     #[error(
-        "the robot is running, and its model stays as it is while it does; stop whoever drives it: without \
-         commands it stops by itself after a second"
+        "the robot is running, and its model stays as it is while it does; stop whoever drives it (without \
+         commands it stops by itself after a second), or let --stop stop the robot"
     )]
     Running,
     /// Somebody else updates.
@@ -420,6 +423,8 @@ pub struct Flashing<'m> {
     deadline_us: u64,
     in_use_us: Option<u64>,
     begins: u32,
+    /// The robot is to be stopped.
+    stops: bool,
     written: u32,
     /// Most that were written since the update began.
     most_written: u32,
@@ -476,6 +481,7 @@ impl<'m> Flashing<'m> {
             deadline_us: u64::MAX,
             in_use_us: None,
             begins: 0,
+            stops: false,
             written: 0,
             most_written: 0,
             chunk: MAX_CHUNK,
@@ -533,6 +539,12 @@ impl<'m> Flashing<'m> {
             self.wake_us = None;
             let ask = self.ask();
             self.exchange.ask(ask, now_us);
+        }
+        if std::mem::take(&mut self.stops) {
+            // Before the request: whoever drives the robot may start it again at any moment.
+            let mut frame = [0; MAX_FRAME];
+            let length = encode(&Message::Stop, &mut frame).unwrap_or(0);
+            out.extend(&frame[..length]);
         }
         self.exchange.send(now_us, out);
         let times = [self.wake_us, self.exchange.due_us(), Some(self.deadline_us)];
@@ -693,6 +705,10 @@ impl<'m> Flashing<'m> {
                 self.go(Step::Restart, now_us);
                 self.wait(AGAIN_US, now_us);
             }
+            (_, Refused::Busy) if self.options.stop => {
+                self.stops = true;
+                self.wait(0, now_us);
+            }
             (_, Refused::Busy) => return Err(FlashError::Running),
             // The request waits on.
             (_, Refused::Working) => {}
@@ -824,13 +840,13 @@ impl<'m> Flashing<'m> {
             return Err(FlashError::BelowFloor { sequence, floor });
         }
         hello.capacities.check(self.model, self.blob.len()).map_err(FlashError::Misfit)?;
-        if hello.mode == Mode::Running {
-            return Err(FlashError::Running);
-        }
-        if self.options.dry_run {
-            self.done(Outcome::Fits, now_us);
-        } else {
-            self.go(Step::Begin, now_us);
+        match hello.mode {
+            _ if self.options.dry_run => self.done(Outcome::Fits, now_us),
+            Mode::Running if !self.options.stop => return Err(FlashError::Running),
+            mode => {
+                self.stops = mode == Mode::Running;
+                self.go(Step::Begin, now_us);
+            }
         }
         Ok(())
     }

@@ -29,6 +29,7 @@ pub fn flash(args: &FlashArgs) -> Result<(), Failure> {
         baud: (!args.port.starts_with("tcp:")).then_some(args.baud),
         dry_run: args.dry_run,
         trial: args.trial,
+        stop: args.stop,
     };
     let port = Port::open(&args.port, args.baud)?;
     let mut flashing = Flashing::new(file.bytes(), &model, signed.as_ref(), options);

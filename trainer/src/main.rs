@@ -384,6 +384,9 @@ struct FlashArgs {
     /// Stop when the model runs on trial: the same command without this confirms it.
     #[arg(long)]
     trial: bool,
+    /// Stop the robot if it is running: a model is installed and confirmed only while it stands.
+    #[arg(long, conflicts_with = "dry_run")]
+    stop: bool,
 }
 
 /// A message for the user.
