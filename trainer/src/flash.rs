@@ -975,12 +975,12 @@ impl<'m> Flashing<'m> {
                 name(&self.release),
                 grouped(self.release.length.into())
             ),
-            Outcome::RunsAlready => format!("{runs} runs already: nothing to do\n"),
+            Outcome::RunsAlready => format!("runs already: {runs}; nothing to do\n"),
             Outcome::OnTrial => format!(
-                "{runs} runs; the same command without --trial and --dry-run confirms it, a restart of the \
-                 controller drops it\n"
+                "runs now: {runs}; the same command without --trial and --dry-run confirms it, a restart of \
+                 the controller drops it\n"
             ),
-            Outcome::Installed => format!("{runs} runs\n"),
+            Outcome::Installed => format!("runs now: {runs}\n"),
         };
         text
     }

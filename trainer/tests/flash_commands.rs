@@ -364,14 +364,14 @@ fn a_model_is_installed_over_a_port() {
     assert!(text.contains("release 7, ") && text.contains("in slot A, on trial"), "{text}");
     assert!(text.contains("the same command without --trial"), "{text}");
     let text = workshop.succeed(&flash);
-    assert!(text.contains("in slot A, confirmed runs\n") && !text.contains("bytes/s"), "{text}");
+    assert!(text.contains("in slot A, confirmed\n") && !text.contains("bytes/s"), "{text}");
     let text = workshop.succeed(&flash);
-    assert!(text.contains("runs already: nothing to do"), "{text}");
+    assert!(text.contains("runs already: ") && text.contains("nothing to do"), "{text}");
 
     // All at once, over the other slot.
     workshop.succeed(&["sign", "model.bin", "--key", "owner.key", "--sequence", "9"]);
     let text = workshop.succeed(&flash);
-    assert!(text.contains(" bytes/s; ") && text.contains("in slot B, confirmed runs\n"), "{text}");
+    assert!(text.contains(" bytes/s; ") && text.contains("in slot B, confirmed\n"), "{text}");
     workshop.succeed(&["sign", "model.bin", "--key", "owner.key", "--sequence", "8"]);
     let message = workshop.refuse(&flash);
     assert!(message.starts_with(&controller.port) && message.contains("--sequence 9"), "{message}");
@@ -384,7 +384,7 @@ fn a_controller_that_trusts_everybody_is_warned_of() {
     let Said { code, stdout, stderr } =
         workshop.run(&["flash", "model.bin", "--port", &controller.port]);
     assert_eq!(code, Some(0), "{stderr}");
-    assert!(stdout.contains("release 0, ") && stdout.contains("confirmed runs"), "{stdout}");
+    assert!(stdout.contains("release 0, ") && stdout.contains("confirmed"), "{stdout}");
     assert!(stderr.starts_with("warning: the controller trusts everybody"), "{stderr}");
     assert_eq!(stderr.lines().count(), 1);
 }
