@@ -1,7 +1,7 @@
 //! Messages between host and controller over a serial line.
 //!
 //! A message is encoded with postcard, followed by its CRC-32 (ISO-HDLC, as in the blob, little-endian),
-//! the whole stuffed with COBS (Cheshire & Baker 2049, "Consistent overhead byte stuffing") and ended by a
+//! the whole stuffed with COBS (Cheshire & Baker 1999, "Consistent overhead byte stuffing") and ended by a
 //! zero byte:
 //!
 //! ```text
@@ -11,7 +11,7 @@
 //! so that a receiver that lost or mistook bytes is in step again after the next zero. A frame that does not
 //! unstuff, or has a wrong checksum, is dropped and counted; nothing is guessed. A controller answers one
 //! that is too long, and one whose message it does not know, with
-//! [`Refused`](crate::update::Refused).
+//! [`Refused`].
 //!
 //! | variant | message | direction |
 //! |---|---|---|
@@ -36,7 +36,7 @@ use crate::control_loop::{Command, ControlLoop, Mode};
 use crate::update::{Answer, Refused, Request, Say, Updates};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
-/// room for takes 204 bytes, the longest chunk of a blob 216.
+/// room for takes 204 bytes, the longest chunk of a blob 213.
 pub const MAX_FRAME: usize = 256;
 /// Number of [`Message::Inputs`].
 const INPUTS: u8 = 3;

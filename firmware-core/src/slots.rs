@@ -11,88 +11,26 @@
 //! [`confirm`](Slots::confirm) and [`abort`](Slots::abort) only while the actuators are switched off, the
 //! loop being in Safe.
 //!
-//! # Layout
-//!
-//! Slot A begins at [`Geometry::offset`], slot B follows it; each is a whole number of sectors. All
-//! numbers are little-endian, the layout is the same on every flash. Version 1:
-//!
-//! | offset in the slot | size | field |
-//! |---|---|---|
-//! | 0 | 4 | magic, the bytes `SLOT` |
-//! | 4 | 2 | version of the layout, 1 |
-//! | 6 | 2 | offset of the payload, 320 |
-//! | 8 | 4 | length of the payload n, at least 1 |
-//! | 12 | 4 | sequence number of the update |
-//! | 16 | 4 | generation: 1 more than the larger one in either slot when the update began |
-//! | 20 | 4 | robot: CRC-32 of its name ([`robot`]) |
-//! | 24 | 32 | SHA-256 of the payload |
-//! | 56 | 4 | reserved, 0 |
-//! | 60 | 4 | CRC-32 of bytes 0 to 59 (ISO-HDLC, as in the blob) |
-//! | 64, 96 | 32 each | committed: name `CMIT` |
-//! | 128, 160 | 32 each | trial begun: name `TRIL` |
-//! | 192, 224 | 32 each | confirmed: name `CNFM` |
-//! | 256, 288 | 32 each | rejected: name `RJCT` |
-//! | 320 | n | payload, one blob |
-//!
-//! A mark has two cells, each with write units of its own (up to 32 bytes). A cell that is set holds the
-//! four bytes of the name, the CRC-32 of the header (its bytes 60 to 63), and ones to the end.
-//!
-//! # States
-//!
-//! ```text
-//!            begin, erase: header's sector first
-//!   any ───────────────► empty ──write, verify──► payload ──commit: header──► headed
-//!                                                                                │ commit: CMIT
-//!                            the other slot boots                                ▼
-//!   rejected ◄── boot: RJCT ── on trial ◄── boot: hash right, TRIL ────────── committed
-//!                                  │ confirm: CNFM                               │ abort: RJCT
-//!                                  ▼                                             ▼
-//!                              confirmed ◄─── every boot                      rejected
-//! ```
-//!
-//! | power cut in | what the next boot finds | and does |
-//! |---|---|---|
-//! | erase | a header, marks or payload that are none any more, or all of the old ones | runs the other slot, which was not touched; `begin` erases again, whatever the sectors read as |
-//! | payload | no header | the same |
-//! | header | a header whose CRC is wrong | the same |
-//! | before the commit mark | a header without it | sets the reject mark, runs the other slot |
-//! | commit mark | a cell that is not exactly the word | sets the reject mark, runs the other slot; if the word is there, the update is committed |
-//! | trial mark | a torn cell | sets the second one and runs the trial; if both are torn, the trial counts as over |
-//! | anywhere on trial | a trial mark without confirmation | sets the reject mark, runs the other slot |
-//! | confirm mark | a torn cell | the same: not confirmed; if the word is there, it is confirmed, and the floor has risen with that same word |
-//! | reject mark | a torn cell | counts as rejected, and sets the second one |
-//!
-//! Why it holds:
+//! A slot begins with a header of 64 bytes, four marks of two cells each, and, at 320, the payload; the layout is
+//! the same on every flash. Every field, the states of a slot, how a boot decides, and why a power cut
+//! anywhere leaves the old or the new model are specified in docs/flash-layout.md. In short:
 //!
 //! - The running slot is only ever marked, never erased. On trial no update may begin, because the other
 //!   slot is what a revert goes back to.
-//! - Each transition is one word that is only programmed where all bits of its write unit are erased, so
-//!   that it can be done again, in the second cell, after a cut. With the header's CRC in it, marks of
-//!   an earlier update or of a half-erased sector do not fit another header.
-//! - A cell that was cut short may read as this now and as that later. So a boot that acts on a mark
-//!   first sets the cell that is still erased, and one that acts on a missing confirmation or commit sets the
-//!   reject mark, which beats all others: what has been decided stays decided.
+//! - Each transition is one word, programmed where all bits are erased, so that it can be done again, in
+//!   the second cell, after a cut. It holds the header's CRC: marks of another update do not fit.
+//! - A boot that acts on what a cut may have left undecided first marks it: what has been decided stays
+//!   decided.
 //! - The trial mark is set before the model is handed to the caller: a model that crashes the
 //!   controller while it is parsed runs once.
-//! - The payload's hash is compared before the header is written, and again at each boot: against cuts the
-//!   commit mark alone is enough, against damage that comes later it is not.
+//! - The floor is the largest sequence number of a confirmed slot, or the one that the image asks for, if
+//!   that is larger. Neither a new nor an old model below it ever runs, but for the factory model: it is the
+//!   last resort.
 //!
-//! # Floor
+//! Sequence numbers and hashes are checked here; who may set them is [`update`](crate::update)'s business.
 //!
-//! The floor is the largest sequence number of a confirmed slot, or the one that the image asks for, if
-//! that is larger. Neither a new nor an old model below it ever runs. It rises with the confirm
-//! mark, needs no storage of its own, and does not fall: while a confirmed model runs, it is the one with the
-//! floor, and is not erased; while the factory model runs, the slot with the larger number is kept.
-//!
-//! # What it does not do
-//!
-//! - A factory model is below any floor: it is the last resort.
-//! - If the header of the confirmed slot decays, its sequence number is lost with it, and the floor
-//!   falls to that of the other slot. If only its payload does, the floor stays, an older model in the
-//!   other slot is refused, and the factory model runs until an update comes.
-//! - Sequence numbers and hashes are checked here; who may set them is [`update`](crate::update)'s business.
-//! - A flash with error correction may answer a torn word with a fault: its driver has to turn it into an
-//!   error, which counts as a torn cell, as an empty slot, or, in the reject mark, as one that does not run.
+//! A flash with error correction may answer a torn word with a fault: its driver has to turn it into an
+//! error, which counts as a torn cell, as an empty slot, or, in the reject mark, as one that does not run.
 //!
 //! ```
 //! # use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash};
