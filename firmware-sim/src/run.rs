@@ -52,7 +52,7 @@ use scenario::{Controller, Scenario};
 use std::collections::VecDeque;
 use std::num::NonZeroU32;
 use std::path::Path;
-use store::{Loop, Speed, Store};
+use store::{Loop, Speed, Started, Store};
 use summary::{Summary, Watch};
 
 /// Voltage of the microcontroller's supply, and where its brown-out detector resets it (V): STM32F407,
@@ -433,7 +433,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
         let booted_us = world.now_us();
         let (mut updates, chosen) = match &installed {
             Some(installed) => {
-                let (updater, chosen, booted) = installed.boot();
+                let Started { updater, chosen, booted } = installed.boot();
                 store.as_deref_mut().map(|store| store.booted(booted, installed)).transpose()?;
                 (Some(updater), chosen)
             }

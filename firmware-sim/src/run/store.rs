@@ -205,13 +205,18 @@ pub(crate) struct Installed {
 
 type Slot = Region<4, SECTOR>;
 
+/// A controller after a reset.
+pub(crate) struct Started<'i, A> {
+    /// Its end of updates.
+    pub(crate) updater: Updater<'i, Slot, Option<Timed>, A>,
+    /// The model that was chosen, unless it is that of the factory.
+    pub(crate) chosen: Option<Blob>,
+    pub(crate) booted: Booted,
+}
+
 impl Installed {
-    /// The controller's end of updates after a reset, and the model that was chosen unless it is that of
-    /// the factory.
-    pub(crate) fn boot(
-        &self,
-    ) -> (Updater<'_, Slot, Option<Timed>, impl FnMut(Payload) -> bool + use<>>, Option<Blob>, Booted)
-    {
+    /// What happens after a reset.
+    pub(crate) fn boot(&self) -> Started<'_, impl FnMut(Payload) -> bool + use<>> {
         let Loop { robot, states, tick_us, sample_us, steps } = &self.of;
         let Controller { clock_mhz, cycles_per_instruction, tick_instructions } =
             self.speed.controller;
@@ -250,10 +255,10 @@ impl Installed {
         let booted = Updater::boot(region(), geometry, identity, 0, trust, accept);
         let (updater, Boot { running, payload, trial, floor, .. }) =
             booted.expect("the slots fit the flash");
-        let blob = payload.and_then(|payload| read(&mut region(), payload));
+        let chosen = payload.and_then(|payload| read(&mut region(), payload));
         let sequence = payload.map_or(0, |payload| payload.sequence);
         let at_us = self.speed.clock.now_ns() / 1000;
-        (updater, blob, Booted { at_us, running, sequence, trial, floor })
+        Started { updater, chosen, booted: Booted { at_us, running, sequence, trial, floor } }
     }
 }
 
