@@ -40,6 +40,113 @@
 //!
 //! A session is a number that the host draws: chunks of an update that is not that of the session are
 //! refused, and while a session is alive no other begins.
+//!
+//! # In a firmware
+//!
+//! [`Updater::boot`] first, then the loop with the model that it chose, then a tick after the other; between
+//! two ticks of a robot at rest [`Port::receive`](crate::link::Port::receive) may be called as often as there
+//! is time.
+//!
+//! ```
+//! # use core::convert::Infallible;
+//! # use embedded_io::{ErrorType as IoErrorType, Read, ReadReady, Write, WriteReady};
+//! # use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash};
+//! # use firmware_core::control_loop::{Command, Mode, Supervisor, Timing};
+//! # use firmware_core::link::{Message, Received, Receiver, encode};
+//! # use firmware_core::update::{Ask, Request, Say};
+//! # struct Memory([u8; 8192]);
+//! # #[derive(Debug)] struct Never;
+//! # impl NorFlashError for Never { fn kind(&self) -> NorFlashErrorKind { NorFlashErrorKind::Other } }
+//! # impl ErrorType for Memory { type Error = Never; }
+//! # impl ReadNorFlash for Memory {
+//! #     const READ_SIZE: usize = 1;
+//! #     fn read(&mut self, at: u32, bytes: &mut [u8]) -> Result<(), Never> {
+//! #         bytes.copy_from_slice(&self.0[at as usize..][..bytes.len()]); Ok(())
+//! #     }
+//! #     fn capacity(&self) -> usize { 8192 }
+//! # }
+//! # impl NorFlash for Memory {
+//! #     const WRITE_SIZE: usize = 4;
+//! #     const ERASE_SIZE: usize = 4096;
+//! #     fn erase(&mut self, from: u32, to: u32) -> Result<(), Never> {
+//! #         self.0[from as usize..to as usize].fill(0xFF); Ok(())
+//! #     }
+//! #     fn write(&mut self, at: u32, bytes: &[u8]) -> Result<(), Never> {
+//! #         self.0[at as usize..][..bytes.len()].copy_from_slice(bytes); Ok(())
+//! #     }
+//! # }
+//! # struct Wire { came: Vec<u8>, said: Vec<u8> }
+//! # impl IoErrorType for Wire { type Error = Infallible; }
+//! # impl Read for Wire {
+//! #     fn read(&mut self, bytes: &mut [u8]) -> Result<usize, Infallible> {
+//! #         let count = bytes.len().min(self.came.len());
+//! #         bytes[..count].copy_from_slice(&self.came[..count]);
+//! #         self.came.drain(..count); Ok(count)
+//! #     }
+//! # }
+//! # impl ReadReady for Wire { fn read_ready(&mut self) -> Result<bool, Infallible> { Ok(!self.came.is_empty()) } }
+//! # impl Write for Wire {
+//! #     fn write(&mut self, bytes: &[u8]) -> Result<usize, Infallible> { self.said.extend(bytes); Ok(bytes.len()) }
+//! #     fn flush(&mut self) -> Result<(), Infallible> { Ok(()) }
+//! # }
+//! # impl WriteReady for Wire { fn write_ready(&mut self) -> Result<bool, Infallible> { Ok(true) } }
+//! # struct Robot(Supervisor);
+//! # impl ControlLoop<2> for Robot {
+//! #     fn command(&mut self, _: Command<2>) {}
+//! #     fn tick(&mut self, now_us: u64) -> Mode { self.0.begin(now_us); self.mode() }
+//! #     fn finish(&mut self, _: u64) -> Mode { self.mode() }
+//! #     fn path(&self) -> &[f32] { &[] }
+//! #     fn supervisor(&self) -> &Supervisor { &self.0 }
+//! #     fn supervisor_mut(&mut self) -> &mut Supervisor { &mut self.0 }
+//! # }
+//! # let flash = Memory([0xFF; 8192]);
+//! # let mut frame = [0; 256];
+//! # let length = encode(&Message::Request(Request { number: 1, ask: Ask::Hello }), &mut frame).unwrap();
+//! # let mut serial = Wire { came: frame[..length].to_vec(), said: Vec::new() };
+//! # let mut queue = firmware_core::control_loop::telemetry::Queue::<2>::new();
+//! # let (_, mut frames) = queue.split();
+//! # let mut clock = [1_000, 1_200].into_iter();
+//! use firmware_core::control_loop::ControlLoop;
+//! use firmware_core::link::Port;
+//! use firmware_core::slots::{Geometry, Which};
+//! use firmware_core::update::{Capacities, Identity, PublicKey, Updater};
+//!
+//! static FACTORY: &[u8] =
+//!     include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/rosbot/model.bin"));
+//! # const KEY: [u8; 32] = [7; 32];
+//!
+//! let identity = Identity {
+//!     firmware: "rosbot 1.0",
+//!     robot: "rosbot",
+//!     factory: FACTORY,
+//!     capacities: Capacities::new::<3, 2>(100_000, 90_000), // a sample of 100 ms, 90,000 instructions a step
+//!     erase_ms: 4_000,
+//!     good_ticks: 1_000,
+//! };
+//! let geometry = Geometry { offset: 0, slot_bytes: 4096 };
+//! // Map the payload; accept it if `parse_for` and `Capacities::check` do.
+//! let accept = |_payload| true;
+//! let booted = Updater::boot(flash, geometry, identity, 0, PublicKey(KEY), accept);
+//! let (mut updater, boot) = booted.unwrap();
+//! assert_eq!(boot.running, Which::Factory); // or where `boot.payload` lies
+//! # let mut robot = Robot(Supervisor::new(Timing { period_us: 10_000, watchdog_us: 1_000_000 }));
+//! let mut port = Port::new();
+//! // Every tick:
+//! let began_us = clock.next().unwrap();
+//! port.receive(&mut serial, &mut robot, &mut updater, began_us);
+//! robot.tick(began_us);
+//! robot.finish(clock.next().unwrap());
+//! updater.ticked(robot.alarms());
+//! port.send(&mut frames, &mut serial);
+//! if updater.resets() && port.is_sent() {
+//!     // Wait until the last byte is out, at most some milliseconds, and reset the controller.
+//! }
+//! # let mut receiver = Receiver::new();
+//! # let said = serial.said.iter().filter_map(|byte| receiver.push(*byte)).last();
+//! # let Some(Received::Message(Message::Answer(answer))) = said else { panic!("{said:?}") };
+//! # let Say::Hello(hello) = answer.say else { panic!() };
+//! # assert_eq!((hello.name.as_str(), hello.capacities.room, hello.key), ("rosbot", 3_776, Some([7; 8])));
+//! ```
 
 use embedded_storage::nor_flash::NorFlash;
 use heapless::{String, Vec};

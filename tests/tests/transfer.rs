@@ -2,6 +2,7 @@
 //! of seconds does, and that the robot ends with the old or the new model whatever happens.
 
 use std::cell::RefCell;
+use std::ops::Range;
 use std::path::Path;
 use std::rc::Rc;
 
@@ -14,9 +15,10 @@ use firmware_core::model::{
     Input, Model, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
 };
 use firmware_core::slots::{PAYLOAD_OFFSET, Which};
+use firmware_sim::fault::Fault;
 use firmware_sim::mcu::UartEnd;
 use firmware_sim::run::host::{Counts, Laptop};
-use firmware_sim::run::scenario::{LineSettings, Scenario};
+use firmware_sim::run::scenario::{FaultText, LineSettings, Scenario};
 use firmware_sim::run::store::Store;
 use firmware_sim::run::summary::Summary;
 use firmware_sim::run::{Blob, run_with};
@@ -81,6 +83,8 @@ struct Installer<'m> {
     outgoing: Vec<u8>,
     /// Drives the robot, too, and starts it whenever it stands.
     drives: bool,
+    /// While the cable is not plugged in (µs).
+    unplugged_us: Range<u64>,
     next_us: u64,
     receiver: Receiver,
     seen: Rc<RefCell<Seen>>,
@@ -112,6 +116,9 @@ impl Laptop for Installer<'_> {
         while matches!(self.end.read_ready(), Ok(true)) {
             let count = self.end.read(&mut bytes).unwrap_or(0);
             received.extend(&bytes[..count]);
+        }
+        if self.unplugged_us.contains(&now_us) {
+            received.clear();
         }
         let mut seen = self.seen.borrow_mut();
         for byte in &received {
@@ -145,6 +152,9 @@ impl Laptop for Installer<'_> {
             }
             Err(error) => seen.result = Some(Err(error)),
         }
+        if self.unplugged_us.contains(&now_us) {
+            self.outgoing.clear();
+        }
         let count = self.end.write(&self.outgoing).unwrap_or(0);
         self.outgoing.drain(..count);
         Ok(())
@@ -155,24 +165,44 @@ impl Laptop for Installer<'_> {
     }
 }
 
-/// Installs a blob on a ROSbot at rest, on a line with this noise.
-fn install(store: &mut Store, blob: &Blob, noise: f64, seconds: f64, seed: u64) -> (Seen, Summary) {
-    let options = Options { session: seed as u32, baud: Some(576_000), ..Options::default() };
-    install_with(store, blob, noise, seconds, (seed, options, false))
+/// What is not as it should be.
+#[derive(Clone, Default)]
+struct Trouble {
+    /// Probability with which a byte is lost, and doubled, and flipped.
+    noise: f64,
+    /// Somebody drives the robot.
+    drives: bool,
+    /// While the cable is not plugged in (µs).
+    unplugged_us: Range<u64>,
+    /// Of the scenario.
+    faults: Vec<Fault>,
 }
 
-/// The same with these options, beside somebody who drives the robot.
+/// Installs a blob on a ROSbot; `seed` is that of the noise.
+fn install(
+    store: &mut Store,
+    blob: &Blob,
+    trouble: Trouble,
+    seconds: f64,
+    seed: u64,
+) -> (Seen, Summary) {
+    let options = Options { session: seed as u32, baud: Some(576_000), ..Options::default() };
+    install_with(store, blob, trouble, seconds, (seed, options))
+}
+
+/// The same with these options.
 fn install_with(
     store: &mut Store,
     blob: &Blob,
-    noise: f64,
+    Trouble { noise, drives, unplugged_us, faults }: Trouble,
     seconds: f64,
-    (seed, options, drives): (u64, Options, bool),
+    (seed, options): (u64, Options),
 ) -> (Seen, Summary) {
     let factory = factory();
     let line =
         LineSettings { loss: noise, doubling: noise, bit_flip: noise, ..LineSettings::default() };
-    let scenario = Scenario { seconds, line, ..Scenario::random(16.0) };
+    let faults = faults.into_iter().map(FaultText).collect();
+    let scenario = Scenario { seconds, line, faults, ..Scenario::random(16.0) };
     let model = blob.model().unwrap();
     let seen = Rc::new(RefCell::new(Seen::default()));
     let installer = |end| Installer {
@@ -180,12 +210,17 @@ fn install_with(
         flashing: Flashing::new(blob.bytes(), &model, None, options),
         outgoing: Vec::new(),
         drives,
+        unplugged_us,
         next_us: 1_000_000,
         receiver: Receiver::new(),
         seen: seen.clone(),
     };
     let summary = run_with(&factory.model().unwrap(), &scenario, seed, store, installer).unwrap();
     (seen.take(), summary)
+}
+
+fn noisy(noise: f64) -> Trouble {
+    Trouble { noise, ..Trouble::default() }
 }
 
 /// The slot that begins here holds the whole blob.
@@ -202,7 +237,7 @@ fn a_clean_line_takes_as_long_as_its_bytes() {
     assert!((15_900..16_500).contains(&large.bytes().len()), "{} bytes", large.bytes().len());
     for (blob, most_s) in [(small, 1.0), (large, 3.0)] {
         let mut store = Store::new(&factory(), None);
-        let (seen, summary) = install(&mut store, &blob, 0.0, 60.0, 1);
+        let (seen, summary) = install(&mut store, &blob, Trouble::default(), 60.0, 1);
         assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{:?}", seen.phases);
         let [asking, erasing, writing, restarting, done] = [
             seen.phases[0].0,
@@ -228,7 +263,7 @@ fn a_clean_line_takes_as_long_as_its_bytes() {
         assert_eq!(boots, [(Which::Factory, false), (Which::A, true)]);
         assert_eq!((summary.deadline_misses, summary.driven_at_rest), (0, 0));
         // It stays.
-        install(&mut store, &blob, 0.0, 1.0, 1);
+        install(&mut store, &blob, Trouble::default(), 1.0, 1);
         let last = store.boots.last().unwrap();
         assert_eq!((last.running, last.trial), (Which::A, false));
     }
@@ -240,14 +275,15 @@ fn a_robot_that_somebody_drives_is_stopped_for_it_if_that_is_asked() {
     let blob = Blob::read(&models.join("skid-rosbot/model.bin")).unwrap();
     let mut store = Store::new(&factory(), None);
     let options = Options { session: 1, ..Options::default() };
+    let driven = Trouble { drives: true, ..Trouble::default() };
     // It begins before anybody drives, and ends where it is to be confirmed.
-    let (seen, _) = install_with(&mut store, &blob, 0.0, 40.0, (1, options, true));
+    let (seen, _) = install_with(&mut store, &blob, driven.clone(), 40.0, (1, options));
     assert_eq!(seen.result, Some(Err(FlashError::Running)), "{:?}", seen.phases);
     assert_eq!(store.boots.len(), 2);
 
     let mut store = Store::new(&factory(), None);
     let options = Options { stop: true, ..options };
-    let (seen, summary) = install_with(&mut store, &blob, 0.0, 40.0, (1, options, true));
+    let (seen, summary) = install_with(&mut store, &blob, driven.clone(), 40.0, (1, options));
     assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{:?}", seen.phases);
     let confirmed_us = seen.at(Phase::Done(Outcome::Installed));
     let trial = seen.running_us.iter().filter(|us| (2_000_000..confirmed_us).contains(us)).count();
@@ -261,7 +297,7 @@ fn the_session_lives_through_an_erase_of_four_seconds() {
     let mut store = Store::new(&factory(), None);
     store.erase_ns = Some(4_000_000_000);
     let blob = dense([3, 3, 3, 4]);
-    let (seen, _) = install(&mut store, &blob, 0.0, 60.0, 1);
+    let (seen, _) = install(&mut store, &blob, Trouble::default(), 60.0, 1);
     assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{:?}", seen.phases);
     let erase = seen.at(Phase::Writing) - seen.at(Phase::Erasing);
     assert!((4_000_000..4_100_000).contains(&erase), "{erase} µs");
@@ -276,7 +312,7 @@ fn a_model_of_four_kilobytes_arrives_on_a_noisy_line() {
     let mut times: Vec<f64> = (1..=100)
         .map(|seed| {
             let mut store = Store::new(&factory(), None);
-            let (seen, summary) = install(&mut store, &blob, 1e-3, 120.0, seed);
+            let (seen, summary) = install(&mut store, &blob, noisy(1e-3), 120.0, seed);
             assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "seed {seed}: {:?}", seen.phases);
             assert!(holds(&store, 0, &blob), "seed {seed}");
             assert_eq!(summary.driven_at_rest, 0);
@@ -297,7 +333,7 @@ fn on_a_very_noisy_line_it_arrives_or_says_why_not() {
     let (mut times, mut failed) = (Vec::new(), 0);
     for seed in 1..=30 {
         let mut store = Store::new(&factory(), None);
-        let (seen, _) = install(&mut store, &blob, 1e-2, 600.0, seed);
+        let (seen, _) = install(&mut store, &blob, noisy(1e-2), 600.0, seed);
         let (booted, last) = (store.boots.len(), *store.boots.last().unwrap());
         match seen.result.clone().expect("it ends") {
             Ok(outcome) => {
@@ -322,4 +358,55 @@ fn on_a_very_noisy_line_it_arrives_or_says_why_not() {
         times.first().copied().unwrap_or(f64::NAN),
         times.last().copied().unwrap_or(f64::NAN)
     );
+}
+
+#[test]
+fn a_cable_that_is_pulled_at_any_moment_and_plugged_in_again_does_not_matter() {
+    let blob = dense([3, 3, 3, 4]);
+    for from_us in (0..1_500_000).step_by(23_000) {
+        // Longer than the controller waits for a session, or shorter.
+        let away_us = if from_us % 2_000 == 0 { 7_000_000 } else { 700_000 };
+        let unplugged_us = from_us..from_us + away_us;
+        let trouble = Trouble { unplugged_us, ..Trouble::default() };
+        let mut store = Store::new(&factory(), None);
+        let (seen, _) = install(&mut store, &blob, trouble, 60.0, 1);
+        assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{from_us} µs: {:?}", seen.phases);
+        assert!(holds(&store, 0, &blob) && store.boots.len() == 2, "{from_us} µs");
+        // What was written is not written again.
+        let erased = seen.phases.iter().filter(|(_, phase)| *phase == Phase::Erasing).count();
+        assert!(erased <= 1, "{from_us} µs: {:?}", seen.phases);
+    }
+}
+
+#[test]
+fn power_that_fails_at_any_moment_of_an_update_costs_no_model() {
+    let blob = dense([3, 3, 3, 4]);
+    let mut dropped = 0;
+    // Every tick of the update, and some of the trial.
+    let moments = (1..200).chain((200..1_400).step_by(40));
+    for tick in moments {
+        let from_s = f64::from(tick) * 0.01;
+        let fault = format!("brown-out@{from_s}..{}=1", from_s + 0.05).parse().unwrap();
+        let trouble = Trouble { faults: vec![fault], ..Trouble::default() };
+        let mut store = Store::new(&factory(), None);
+        let (seen, summary) = install(&mut store, &blob, trouble, 60.0, 1);
+        match seen.result.clone().expect("it ends") {
+            Ok(outcome) => assert_eq!(outcome, Outcome::Installed),
+            Err(FlashError::Dropped(_)) => dropped += 1,
+            Err(error) => panic!("{from_s} s: {error}"),
+        }
+        assert!(summary.resets > 0 && summary.driven_at_rest == 0, "{from_s} s");
+        for boot in &store.boots {
+            assert!(boot.running == Which::Factory || holds(&store, 0, &blob), "{from_s} s");
+        }
+        // It can be done again.
+        if seen.result != Some(Ok(Outcome::Installed)) {
+            let (again, _) = install(&mut store, &blob, Trouble::default(), 60.0, 1);
+            assert_eq!(again.result, Some(Ok(Outcome::Installed)), "{from_s} s");
+        }
+        install(&mut store, &blob, Trouble::default(), 1.0, 1);
+        let last = store.boots.last().unwrap();
+        assert!(last.running != Which::Factory && !last.trial, "{from_s} s: {last}");
+    }
+    assert!(dropped > 20, "a reset ends a trial: {dropped}");
 }

@@ -23,7 +23,10 @@ use firmware_core::slots::sha256;
 use firmware_core::update::{Ask, MAX_CHUNK, PublicKey, Request, Trust};
 use firmware_core::{Model, Predictor, PredictorState};
 
+mod bits;
 mod host;
+
+use host::Asked;
 
 /// Repetitions that are counted together: a tick is then less than a hundredth of an instruction.
 const REPETITIONS: u32 = 1_000;
@@ -69,6 +72,17 @@ fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
 }
 
 fn measure() -> Option<()> {
+    let mut line = [0; 256];
+    let asked = host::asked(&mut line);
+    if let Some(Asked::Bits(steps)) = asked {
+        for blob in MODELS {
+            let model = parse(&blob.0).ok()?;
+            let (predicted, hash) = bits::bits(&model, steps)?;
+            let robot = model.structure().robot();
+            hprintln!("{} {} of {} {:016x}", robot, predicted, steps, hash);
+        }
+        return Some(());
+    }
     let mut timer = cortex_m::Peripherals::take()?.SYST;
     timer.set_clock_source(SystClkSource::Core);
     timer.set_reload(0x00FF_FFFF);
@@ -84,8 +98,11 @@ fn measure() -> Option<()> {
         per_tick
     );
     update(per_tick)?;
-    let mut name = [0; 256];
-    let Some(mut list) = host::list(&mut name).and_then(host::File::open) else {
+    let list = match asked {
+        Some(Asked::List(file)) => host::File::open(file),
+        _ => None,
+    };
+    let Some(mut list) = list else {
         for (i, blob) in MODELS.iter().enumerate() {
             one(i, &blob.0, per_tick)?;
         }

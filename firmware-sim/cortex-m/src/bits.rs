@@ -1,0 +1,88 @@
+//! What a model predicts from random samples, as a hash of all its bits. The same code runs on the target
+//! and, through tests/examples/target_bits.rs, on the host.
+
+use firmware_core::{Model, Predictor, PredictorState};
+
+/// Steps from one set of random measurements to the next.
+const ROLLOUT: u32 = 8;
+/// Samples of a model's history at most, the present one included.
+const SAMPLES: usize = firmware_core::capacity::MAX_LAG + 1;
+
+/// Numbers by xorshift (Marsaglia 2003), the same everywhere.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    /// Within ±`most`; now and then the bound itself, nothing, or a number so small that it is not normal.
+    fn number(&mut self, most: f32) -> f32 {
+        let bits = self.next();
+        let sign = if bits & 1 == 0 { 1.0 } else { -1.0 };
+        // Exact: 24 bits.
+        let share = ((bits >> 40) as f32) / 16_777_216.0;
+        match (bits >> 1) % 64 {
+            0 => sign * most,
+            1 => sign * 0.0,
+            2 => sign * share * 1e-40,
+            _ => sign * share * most,
+        }
+    }
+}
+
+/// FNV-1a over the words.
+fn hash(hash: u64, word: u32) -> u64 {
+    (hash ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01B3)
+}
+
+/// Predicts `steps` samples, in rollouts of eight after random measurements, with random inputs, some of
+/// them beyond their range; how many did not diverge, and the hash of all coordinates and of every error.
+pub fn bits(model: &Model<'_>, steps: u32) -> Option<(u32, u64)> {
+    let structure = model.structure();
+    let (n, m) = (structure.states().len(), structure.inputs().len());
+    let predictor = Predictor::new(model);
+    let mut state = PredictorState::new();
+    let mut random = Random(0x9E37_79B9_7F4A_7C15);
+    let mut result = 0xCBF2_9CE4_8422_2325;
+    let mut predicted = 0;
+    for step in 0..steps {
+        if step.is_multiple_of(ROLLOUT) {
+            state = PredictorState::new();
+            let mut coordinates = [0.0; firmware_core::capacity::MAX_STATES];
+            let coordinates = coordinates.get_mut(..n)?;
+            let mut applied = [0.0; firmware_core::capacity::MAX_INPUTS];
+            for _ in 0..=structure.lag().min(SAMPLES) {
+                for x in &mut *coordinates {
+                    // A motion: what changes at once is far from any data.
+                    *x = 0.9 * *x + random.number(0.3);
+                }
+                for (u, input) in applied.iter_mut().zip(structure.inputs()) {
+                    *u = random.number(input.range[1]);
+                }
+                predictor.observe(&mut state, applied.get(..m)?, coordinates).ok()?;
+            }
+        }
+        let mut input = [0.0; firmware_core::capacity::MAX_INPUTS];
+        for (u, of) in input.iter_mut().zip(structure.inputs()) {
+            *u = random.number(1.2 * of.range[1]);
+        }
+        match predictor.step(&mut state, input.get(..m)?) {
+            Ok(()) => {
+                predicted += 1;
+                let mut out = [0.0; firmware_core::capacity::MAX_STATES];
+                let out = out.get_mut(..n)?;
+                predictor.coordinates(&state, out).ok()?;
+                for x in out {
+                    result = hash(result, x.to_bits());
+                }
+                result = hash(result, u32::from(state.out_of_range().is_some()));
+            }
+            Err(_) => result = hash(result, u32::MAX),
+        }
+    }
+    Some((predicted, result))
+}
