@@ -113,8 +113,8 @@ impl Monitor {
             verdict.alarm |= *sum > FAR;
         }
         let told = if verdict.ratio > 1.0 { self.beyond } else { self.within };
-        // `within` is negative, or 0 with a sum that stays there.
-        self.often = (self.often + told).clamp(0.0, OFTEN - CALM * self.within);
+        // `within` is negative, or 0 with a sum that stays there. (`clamp` would panic where it is not.)
+        self.often = (self.often + told).max(0.0).min(OFTEN - CALM * self.within);
         verdict.alarm |= self.often > OFTEN;
         verdict
     }

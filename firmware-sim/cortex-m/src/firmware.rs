@@ -1,0 +1,216 @@
+//! A firmware with both loops, the line and the model slots, on devices that are not there: what the core
+//! takes of flash and memory, and what in it may panic.
+
+use core::convert::Infallible;
+use core::hint::black_box;
+
+use embedded_hal::digital::{ErrorType as PinErrorType, OutputPin};
+use embedded_hal::pwm::{ErrorType as PwmErrorType, SetDutyCycle};
+use embedded_io::{ErrorType as IoErrorType, Read, ReadReady, Write, WriteReady};
+use embedded_storage::nor_flash::{
+    ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
+};
+use firmware_core::blob::Aligned;
+use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
+use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
+use firmware_core::control_loop::telemetry::Queue;
+use firmware_core::control_loop::{ControlLoop, Rosbot, SoftLeg, Telemetry};
+use firmware_core::device::{EncoderCount, PositionSensor};
+use firmware_core::link::Port;
+use firmware_core::slots::{Geometry, Payload};
+use firmware_core::update::{Capacities, Identity, Trust, Updater};
+
+static ROSBOT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/skid-rosbot/model.bin"));
+static LEG: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/soft-leg/model.bin"));
+
+/// Every device: what it reads nobody knows, what it writes goes nowhere.
+struct Nowhere;
+
+impl PwmErrorType for Nowhere {
+    type Error = Infallible;
+}
+
+impl SetDutyCycle for Nowhere {
+    fn max_duty_cycle(&self) -> u16 {
+        black_box(4_666)
+    }
+    fn set_duty_cycle(&mut self, duty: u16) -> Result<(), Infallible> {
+        black_box(duty);
+        Ok(())
+    }
+}
+
+impl PinErrorType for Nowhere {
+    type Error = Infallible;
+}
+
+impl OutputPin for Nowhere {
+    fn set_low(&mut self) -> Result<(), Infallible> {
+        black_box(false);
+        Ok(())
+    }
+    fn set_high(&mut self) -> Result<(), Infallible> {
+        black_box(true);
+        Ok(())
+    }
+}
+
+impl EncoderCount for Nowhere {
+    type Error = ();
+    fn count(&mut self) -> Result<u16, ()> {
+        black_box(Ok(1))
+    }
+}
+
+impl<const N: usize> PositionSensor<N> for Nowhere {
+    type Error = ();
+    fn measure(&mut self) -> Result<Option<[f32; N]>, ()> {
+        black_box(Ok(Some([0.0; N])))
+    }
+}
+
+impl IoErrorType for Nowhere {
+    type Error = Infallible;
+}
+
+impl Read for Nowhere {
+    fn read(&mut self, bytes: &mut [u8]) -> Result<usize, Infallible> {
+        black_box(&mut *bytes);
+        Ok(black_box(1))
+    }
+}
+
+impl ReadReady for Nowhere {
+    fn read_ready(&mut self) -> Result<bool, Infallible> {
+        Ok(black_box(true))
+    }
+}
+
+impl Write for Nowhere {
+    fn write(&mut self, bytes: &[u8]) -> Result<usize, Infallible> {
+        Ok(black_box(bytes.len()))
+    }
+    fn flush(&mut self) -> Result<(), Infallible> {
+        Ok(())
+    }
+}
+
+impl WriteReady for Nowhere {
+    fn write_ready(&mut self) -> Result<bool, Infallible> {
+        Ok(black_box(true))
+    }
+}
+
+/// The flash failed.
+#[derive(Debug)]
+struct Failed;
+
+impl NorFlashError for Failed {
+    fn kind(&self) -> NorFlashErrorKind {
+        NorFlashErrorKind::Other
+    }
+}
+
+impl ErrorType for Nowhere {
+    type Error = Failed;
+}
+
+impl ReadNorFlash for Nowhere {
+    const READ_SIZE: usize = 1;
+    fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), Failed> {
+        black_box((offset, &mut *bytes));
+        black_box(Ok(()))
+    }
+    fn capacity(&self) -> usize {
+        black_box(256 * 1024)
+    }
+}
+
+impl NorFlash for Nowhere {
+    const WRITE_SIZE: usize = 4;
+    const ERASE_SIZE: usize = 128 * 1024;
+    fn erase(&mut self, from: u32, to: u32) -> Result<(), Failed> {
+        black_box((from, to));
+        black_box(Ok(()))
+    }
+    fn write(&mut self, offset: u32, bytes: &[u8]) -> Result<(), Failed> {
+        black_box((offset, bytes));
+        black_box(Ok(()))
+    }
+}
+
+/// One of two robots; never comes back.
+pub fn run(trust: impl Trust + Copy) -> Option<()> {
+    if black_box(true) { rosbot(trust) } else { leg(trust) }
+}
+
+fn identity(
+    robot: &'static str,
+    factory: &'static [u8],
+    capacities: Capacities,
+) -> Identity<'static> {
+    Identity { firmware: "image", robot, factory, capacities, erase_ms: 4_000, good_ticks: 1_000 }
+}
+
+#[inline(never)]
+fn rosbot(trust: impl Trust) -> Option<()> {
+    let model = firmware_core::parse_for("skid-rosbot", &ROSBOT.0).ok()?;
+    let mut queue = Queue::<4>::new();
+    let (producer, mut frames) = queue.split();
+    let sides = Sides { right: Motor::new(Nowhere, Nowhere), left: Motor::new(Nowhere, Nowhere) };
+    let mut robot = Rosbot::<_, _, _, 10>::new(
+        &model,
+        (sides, (Nowhere, Nowhere), Nowhere),
+        RosbotSettings::default(),
+        Telemetry::new(producer),
+    )
+    .ok()?;
+    let capacities = Capacities::new::<3, 2>(100_000, 0);
+    serve(&mut robot, trust, identity("skid-rosbot", &ROSBOT.0, capacities), &mut frames)
+}
+
+#[inline(never)]
+fn leg(trust: impl Trust) -> Option<()> {
+    let model = firmware_core::parse_for("soft-leg", &LEG.0).ok()?;
+    let mut queue = Queue::<4>::new();
+    let (producer, mut frames) = queue.split();
+    let pneumatics = Pneumatics {
+        bending: Chamber::new(Nowhere, Nowhere),
+        extension: Chamber::new(Nowhere, Nowhere),
+        input_pump: Nowhere,
+        exhaust_pump: Nowhere,
+    };
+    let mut leg = SoftLeg::<_, _, 20>::new(
+        &model,
+        pneumatics,
+        Nowhere,
+        SoftLegSettings::default(),
+        Telemetry::new(producer),
+    )
+    .ok()?;
+    let capacities = Capacities::new::<2, 2>(50_000, 0);
+    serve(&mut leg, trust, identity("soft-leg", &LEG.0, capacities), &mut frames)
+}
+
+fn serve(
+    robot: &mut impl ControlLoop<2>,
+    trust: impl Trust,
+    identity: Identity<'static>,
+    frames: &mut firmware_core::control_loop::telemetry::Frames<'_>,
+) -> Option<()> {
+    let geometry = Geometry { offset: 0, slot_bytes: 128 * 1024 };
+    let accept = |payload: Payload| black_box(payload.length) > 0;
+    let booted = Updater::boot(Nowhere, geometry, identity, 0, trust, accept);
+    let (mut updater, _) = booted.ok()?;
+    let mut port = Port::new();
+    let mut serial = Nowhere;
+    while !(updater.resets() && port.is_sent()) {
+        let now_us = black_box(0);
+        port.receive(&mut serial, robot, &mut updater, now_us);
+        robot.tick(now_us);
+        robot.finish(black_box(0));
+        updater.ticked(robot.alarms());
+        port.send(frames, &mut serial);
+    }
+    None
+}
