@@ -183,6 +183,7 @@ static void bad_blobs(void) {
 
     EXPECT(KOOPMAN_OK, koopman_load(&bad, copy, length, NULL));
     EXPECT(KOOPMAN_ERROR_NULL, koopman_load(NULL, copy, length, NULL));
+    EXPECT(KOOPMAN_ERROR_NULL, koopman_load(NULL, NULL, 0, NULL));
     EXPECT(KOOPMAN_ERROR_NULL, koopman_load(&bad, NULL, length, NULL));
     EXPECT(KOOPMAN_ERROR_NO_MODEL, koopman_coordinates(&bad, &state, x, STATES));
     EXPECT(KOOPMAN_ERROR_MISALIGNED,

@@ -25,16 +25,16 @@
  * Time      No function waits or repeats without a bound. koopman_load reads every byte of the blob a
  *           few times; a step takes what `trainer inspect` and the README say; a rollout takes its
  *           horizon of steps.
- * Stack     koopman_load is the deepest; firmware-core/c/run prints how deep.
+ * Stack     koopman_load takes 14 KB on a Cortex-M4F, everything else 600 B with a sparse model and
+ *           1.5 KB with a dense one; firmware-core/c/run prints it.
  * Checks    Every pointer and length is checked as far as it can be: NULL, alignment, length. That the
  *           memory is there and that no one else writes to it during the call is for the caller. A
- *           model or a state with no valid content is recognised by a mark, if not by all means: begin
- *           with zeros (static objects do).
- * Panics    There are none: no function of the library gets to its panic handler, and the linker drops
- *           it under --gc-sections. If you find it in an image, it
- *           loops for ever.
- *
- * A const in a parameter means what it says: it is only read.
+ *           model or a state with nothing in it is recognised by a mark that is not there; other memory
+ *           is not likely to have it, and memory of zeros, such as static objects, never does.
+ * Panics    There are none. Rust wants a handler, so the library has one, which would loop for ever; no
+ *           function gets to it, and a linker with --gc-sections leaves it out.
+ * Build     The floats are in registers of the floating-point unit: compile for the ABI that the
+ *           library is built for (thumbv7em-none-eabihf: -mfloat-abi=hard) and switch the unit on.
  */
 
 #ifndef KOOPMAN_H
@@ -235,7 +235,8 @@ typedef struct {
 /*
  All that moves while a predictor works: the samples that a prediction looks at, measured or
  predicted. The memory is the caller's; what is in it is the library's. A copy (`ahead = state`) is
- a state of its own. It belongs to the model that it has observed with: another one finds it empty.
+ a state of its own. It belongs to the model that it has observed with: initialise it anew before
+ another one uses it.
  */
 typedef struct {
     size_t pointers[KOOPMAN_STATE_POINTERS];

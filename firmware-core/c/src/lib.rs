@@ -10,7 +10,7 @@
 //! | [`error`] | `koopman_error_t` and the names of errors |
 //! | [`model`] | `koopman_model_t`: load, shape, names, error bounds |
 //! | [`state`] | `koopman_state_t`: observe, step, rollout |
-//! | `pointer` (private) | pointers and lengths from C, checked once: most of what is unsafe |
+//! | `pointer` (private) | pointers and lengths from C, checked once, and the marks of objects |
 //!
 //! `run` in this folder builds the library for a Cortex-M4F, links [the example](../example/main.c)
 //! with it, runs that in QEMU, and compares with what `firmware-core` predicts on the host.

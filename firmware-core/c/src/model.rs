@@ -75,19 +75,21 @@ pub unsafe extern "C" fn koopman_load(
     robot: *const c_char,
 ) -> koopman_error_t {
     answer(|| {
-        // SAFETY: `room` was asked; the rest is the caller's word.
-        unsafe { Marked::<Loaded>::clear(model)? };
         // SAFETY: the caller's word, for as long as the model is used.
-        let bytes = unsafe { bytes(blob, length)? };
-        if overlap((bytes.as_ptr(), length), (model.cast_const(), 1)) {
+        let bytes = unsafe { bytes(blob, length) };
+        if bytes.is_ok() && overlap((blob.cast::<u8>(), length), (model.cast_const(), 1)) {
             return Err(KOOPMAN_ERROR_OVERLAP);
         }
-        let loaded = firmware_core::parse(bytes)?;
+        // SAFETY: `room` was asked; the rest is the caller's word.
+        unsafe { Marked::<Loaded>::clear(model)? };
+        let bytes = bytes?;
+        let parsed = firmware_core::parse(bytes);
+        let loaded = parsed.as_ref().map_err(|error| *error)?;
         // SAFETY: the caller's word.
         if !(robot.is_null() || unsafe { is_text(robot, loaded.structure().robot()) }) {
             return Err(KOOPMAN_ERROR_ANOTHER_ROBOT);
         }
-        // SAFETY: as above.
+        // SAFETY: as above; a model owns nothing.
         unsafe { Marked::write(model, MARK, loaded) }
     })
 }

@@ -5,6 +5,7 @@
 //! meanwhile, is the caller's word.
 
 use core::ffi::c_void;
+use core::mem::offset_of;
 use core::slice;
 
 use crate::error::koopman_error_t::{self, *};
@@ -81,13 +82,13 @@ pub(crate) unsafe fn put<T>(pointer: *mut T, value: T) -> Result<(), koopman_err
     Ok(())
 }
 
-/// Whether two arrays share memory.
+/// Whether two arrays share memory; NULL and empty ones do not.
 pub(crate) fn overlap<T, U>(a: (*const T, usize), b: (*const U, usize)) -> bool {
-    let range =
-        |from: usize, length: usize, size| (from, from.saturating_add(length.saturating_mul(size)));
-    let (from_a, to_a) = range(a.0.addr(), a.1, size_of::<T>());
-    let (from_b, to_b) = range(b.0.addr(), b.1, size_of::<U>());
-    from_a < to_b && from_b < to_a
+    let end = |from: usize, length: usize, size| from.saturating_add(length.saturating_mul(size));
+    let (from_a, to_a) = (a.0.addr(), end(a.0.addr(), a.1, size_of::<T>()));
+    let (from_b, to_b) = (b.0.addr(), end(b.0.addr(), b.1, size_of::<U>()));
+    let there = |from, to| from != 0 && from != to;
+    there(from_a, to_a) && there(from_b, to_b) && from_a < to_b && from_b < to_a
 }
 
 /// An object of this library in memory of the caller, behind a mark that says that it is one.
@@ -98,18 +99,22 @@ pub(crate) struct Marked<T> {
 }
 
 impl<T> Marked<T> {
-    /// Puts an object there.
+    /// Copies an object there. It is not passed by value, or it would be on the stack once more.
     ///
     /// # Safety
-    /// The caller's object `O` has [`room`], is the caller's, and no one else touches it.
+    /// The caller's object `O` has [`room`], is the caller's, and no one else touches it. A `T` owns
+    /// nothing, so that its bytes are another one.
     pub(crate) unsafe fn write<O>(
         pointer: *mut O,
         mark: u32,
-        object: T,
+        object: &T,
     ) -> Result<(), koopman_error_t> {
         check(pointer, 1)?;
+        let to = pointer.wrapping_byte_add(offset_of!(Self, object)).cast::<T>();
         // SAFETY: not null, aligned, large enough; what was there has nothing to be dropped.
-        unsafe { pointer.cast::<Self>().write(Self { mark, object }) };
+        unsafe { to.copy_from_nonoverlapping(object, 1) };
+        // SAFETY: as above; the mark is the first field.
+        unsafe { pointer.cast::<u32>().write(mark) };
         Ok(())
     }
 
@@ -164,4 +169,33 @@ impl<T> Marked<T> {
 /// Whether the header's object `O` has room for a marked `T`.
 pub(crate) const fn room<O, T>() -> bool {
     size_of::<Marked<T>>() <= size_of::<O>() && align_of::<Marked<T>>() <= align_of::<O>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn overlapping() {
+        let numbers = [0.0_f32; 8];
+        let at = |from: usize, length| (numbers.as_ptr().wrapping_add(from), length);
+        assert!(overlap(at(0, 4), at(3, 1)) && overlap(at(3, 1), at(0, 4)));
+        assert!(!overlap(at(0, 4), at(4, 4)) && !overlap(at(4, 4), at(0, 4)));
+        assert!(!overlap(at(0, 4), at(2, 0)) && !overlap((core::ptr::null::<u8>(), 99), at(0, 1)));
+        // Nothing wraps round.
+        assert!(overlap(at(0, usize::MAX), at(7, 1)));
+    }
+
+    #[test]
+    fn impossible_arrays() {
+        let number = 0.0_f32;
+        let at = &raw const number;
+        assert_eq!(check(at, 1), Ok(()));
+        assert_eq!(check(core::ptr::null::<f32>(), 1), Err(KOOPMAN_ERROR_NULL));
+        assert_eq!(check(at.wrapping_byte_add(1), 1), Err(KOOPMAN_ERROR_MISALIGNED));
+        assert_eq!(check(at, usize::MAX / 4 + 1), Err(KOOPMAN_ERROR_LENGTH));
+        assert_eq!(check(at, isize::MAX as usize / 4 + 1), Err(KOOPMAN_ERROR_LENGTH));
+        let last = core::ptr::without_provenance::<f32>(usize::MAX - 3);
+        assert_eq!(check(last, 1), Err(KOOPMAN_ERROR_LENGTH));
+    }
 }

@@ -14,7 +14,8 @@ pub const KOOPMAN_STATE_WORDS: usize = 307;
 
 /// All that moves while a predictor works: the samples that a prediction looks at, measured or
 /// predicted. The memory is the caller's; what is in it is the library's. A copy (`ahead = state`) is
-/// a state of its own. It belongs to the model that it has observed with: another one finds it empty.
+/// a state of its own. It belongs to the model that it has observed with: initialise it anew before
+/// another one uses it.
 #[repr(C)]
 pub struct koopman_state_t {
     pointers: [usize; KOOPMAN_STATE_POINTERS],
@@ -50,8 +51,8 @@ unsafe fn read<'a>(state: *const koopman_state_t) -> Result<&'a PredictorState, 
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn koopman_state_init(state: *mut koopman_state_t) -> koopman_error_t {
     answer(|| {
-        // SAFETY: `room` was asked; the rest is the caller's word.
-        unsafe { Marked::write(state, MARK, PredictorState::<f32>::new()) }
+        // SAFETY: `room` was asked, and a state owns nothing; the rest is the caller's word.
+        unsafe { Marked::write(state, MARK, &PredictorState::<f32>::new()) }
     })
 }
 

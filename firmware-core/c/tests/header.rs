@@ -1,4 +1,4 @@
-//! include/koopman.h is what cbindgen makes of the sources, and the README's C is the example's.
+//! include/koopman.h is what cbindgen makes of the sources.
 //!
 //! After a change of the interface, `KOOPMAN_HEADER=write cargo test --test header` writes it.
 
