@@ -60,6 +60,7 @@
 //! text and lists with their length first.
 
 use crc::{CRC_32_ISO_HDLC, Crc};
+use serde::Deserialize;
 
 use crate::Scalar;
 use crate::capacity::MAX_STATES;
@@ -174,6 +175,12 @@ pub enum ParseError {
     AnotherRobot,
 }
 
+impl From<ModelError> for ParseError {
+    fn from(error: ModelError) -> Self {
+        Self::Model(error)
+    }
+}
+
 /// Why a model cannot be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -271,8 +278,10 @@ pub fn parse(bytes: &[u8]) -> Result<Model<'_>, ParseError> {
 /// # Errors
 /// As [`parse`], and [`ParseError::AnotherRobot`].
 pub fn parse_for<'a>(robot: &str, bytes: &'a [u8]) -> Result<Model<'a>, ParseError> {
-    let model = parse(bytes)?;
-    if model.structure().robot() == robot { Ok(model) } else { Err(ParseError::AnotherRobot) }
+    match parse(bytes) {
+        Ok(model) if model.structure().robot() != robot => Err(ParseError::AnotherRobot),
+        parsed => parsed,
+    }
 }
 
 /// Reads the blob at the beginning of a flash slot, whatever follows it; [`length`] says where it
@@ -291,31 +300,60 @@ pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
     if expected != found {
         return Err(ParseError::Checksum { expected, found });
     }
-    let sections = Sections::new(blob)?;
+    match Sections::new(blob) {
+        Ok(sections) => read_model(&sections),
+        Err(error) => Err(error),
+    }
+}
 
-    let metadata = sections.bytes(METADATA)?;
-    let (repr, rest) =
-        postcard::take_from_bytes::<ModelRepr<'_>>(metadata).map_err(|error| match error {
-            // What serde and heapless refuse although the bytes are postcard.
-            postcard::Error::SerdeDeCustom => ParseError::Unsupported,
-            _ => ParseError::Metadata,
-        })?;
-    if !rest.is_empty() {
-        return Err(ParseError::Metadata);
+// A model is kilobytes, and so are the parts that it is made of. Below, every part is made in a frame of
+// its own, which is off the stack when the next one begins, and results are passed on as they are: what
+// is unwrapped and wrapped again is there twice.
+
+/// The model of a blob whose sections are there.
+#[inline(never)]
+fn read_model<'a>(sections: &Sections<'a>) -> Result<Model<'a>, ParseError> {
+    match read_structure(sections) {
+        Ok(structure) => {
+            let coefficients = sections.numbers(COEFFICIENTS)?;
+            let ranges = present(sections.numbers(RANGES))?;
+            let terms = present(sections.terms())?;
+            Model::join(structure, terms, coefficients, ranges, |model| complete(model, sections))
+        }
+        Err(error) => Err(error),
     }
-    let structure = Structure::try_from(repr).map_err(ParseError::Model)?;
-    let coefficients = sections.numbers(COEFFICIENTS)?;
-    let ranges = present(sections.numbers(RANGES))?;
-    let mut model = match present(sections.terms())? {
-        None => Model::new(structure, coefficients, ranges),
-        Some(terms) => Model::new_sparse(structure, terms, coefficients, ranges),
+}
+
+/// The metadata, checked.
+#[inline(never)]
+fn read_structure<'a>(sections: &Sections<'a>) -> Result<Structure<'a>, ParseError> {
+    let mut reader = postcard::Deserializer::from_bytes(sections.bytes(METADATA)?);
+    match read_metadata(&mut reader) {
+        Ok(repr) => match reader.finalize() {
+            Ok([]) => Structure::check(repr),
+            _ => Err(ParseError::Metadata),
+        },
+        // What serde and heapless refuse although the bytes are postcard.
+        Err(postcard::Error::SerdeDeCustom) => Err(ParseError::Unsupported),
+        Err(_) => Err(ParseError::Metadata),
     }
-    .map_err(ParseError::Model)?;
+}
+
+/// The metadata as they are.
+#[inline(never)]
+fn read_metadata<'a>(
+    reader: &mut postcard::Deserializer<'a, postcard::de_flavors::Slice<'a>>,
+) -> postcard::Result<ModelRepr<'a>> {
+    ModelRepr::deserialize(reader)
+}
+
+/// Gives the model its error bounds, if it has any, and tries the stored prediction.
+#[inline(never)]
+fn complete<'a>(model: &mut Model<'a>, sections: &Sections<'a>) -> Result<(), ParseError> {
     if let Some(words) = present(sections.words(ERROR_BOUNDS))? {
         let bounds = error_bounds(model.structure().states().len(), words)?;
-        model = model.with_error_bounds(bounds).map_err(ParseError::Model)?;
+        model.set_error_bounds(bounds).map_err(ParseError::Model)?;
     }
-
     let numbers = sections.numbers(SELF_TEST)?;
     let wrong = ParseError::SectionLength {
         kind: SELF_TEST.0,
@@ -323,8 +361,8 @@ pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
         found: numbers.len().saturating_mul(4),
     };
     let self_test = SelfTest::split(model.structure(), numbers).ok_or(wrong)?;
-    match self_test.failure(&model) {
-        None => Ok(model),
+    match self_test.failure(model) {
+        None => Ok(()),
         Some(coordinate) => Err(ParseError::SelfTest { coordinate }),
     }
 }

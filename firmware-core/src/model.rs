@@ -216,6 +216,14 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
     type Error = ModelError;
 
     fn try_from(repr: ModelRepr<'a>) -> Result<Self, ModelError> {
+        Self::check(repr)
+    }
+}
+
+impl<'a> Structure<'a> {
+    /// [`try_from`](Self::try_from) with the caller's error, so that no result has to be moved.
+    #[inline(never)]
+    pub(crate) fn check<E: From<ModelError>>(repr: ModelRepr<'a>) -> Result<Self, E> {
         let ModelRepr {
             robot,
             sample_time_s,
@@ -228,16 +236,16 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
             provenance,
         } = repr;
         if states.is_empty() {
-            return Err(ModelError::NoState);
+            return Err(ModelError::NoState.into());
         }
         if !(sample_time_s.is_finite() && sample_time_s > 0.0) {
-            return Err(ModelError::SampleTime);
+            return Err(ModelError::SampleTime.into());
         }
         let (mut outputs, mut trigonometric) = (0_u8, 0_u8);
         for (index, state) in states.iter().enumerate() {
             let [low, high] = state.limit;
             if low.partial_cmp(&high) != Some(Ordering::Less) {
-                return Err(ModelError::Number { field: "limit of a state", index });
+                return Err(ModelError::Number { field: "limit of a state", index }.into());
             }
             let absolute_angle = (state.space, state.target) == (Space::Circle, Target::Absolute);
             outputs = outputs.saturating_add(if absolute_angle { 2 } else { 1 });
@@ -248,7 +256,7 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
         for (index, input) in inputs.iter().enumerate() {
             let [low, high] = input.range;
             if !(low < high && low.is_finite() && high.is_finite()) {
-                return Err(ModelError::Number { field: "range of an input", index });
+                return Err(ModelError::Number { field: "range of an input", index }.into());
             }
         }
         check_symmetry(symmetry, &states)?;
@@ -272,10 +280,12 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
                 Source::Input(i) => usize::from(i) < inputs.len(),
             };
             if !fits || usize::from(o.lag) > MAX_LAG {
-                return Err(ModelError::Observable { observable: index });
+                return Err(ModelError::Observable { observable: index }.into());
             }
             if !(o.centre.is_finite() && o.gain.is_finite() && o.gain != 0.0) {
-                return Err(ModelError::Number { field: "centre or gain of an observable", index });
+                return Err(
+                    ModelError::Number { field: "centre or gain of an observable", index }.into()
+                );
             }
             lag = lag.max(o.lag);
         }
@@ -463,7 +473,7 @@ impl<'a, S: Scalar> Model<'a, S> {
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
     ) -> Result<Self, ModelError> {
-        Self::checked(structure, None, coefficients, ranges)
+        Self::join(structure, None, coefficients, ranges, |_| Ok(()))
     }
 
     /// Joins a structure whose blocks are single factors, a chain of products of their functions and
@@ -516,30 +526,35 @@ impl<'a, S: Scalar> Model<'a, S> {
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
     ) -> Result<Self, ModelError> {
-        let terms = SparseTerms::new(structure.dictionary(), terms).map_err(ModelError::Sparse)?;
-        Self::checked(structure, Some(terms), coefficients, ranges)
+        Self::join(structure, Some(terms), coefficients, ranges, |_| Ok(()))
     }
 
-    /// Checks the numbers against a structure and the terms it goes with.
-    fn checked(
+    /// A dense model, or a sparse one with these terms, to be completed by the caller where it lies;
+    /// with the caller's error, so that no result has to be moved.
+    #[inline(never)]
+    pub(crate) fn join<E: From<ModelError>>(
         structure: Structure<'a>,
-        terms: Option<SparseTerms<'a>>,
+        terms: Option<&'a [[u8; 2]]>,
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
-    ) -> Result<Self, ModelError> {
+        complete: impl FnOnce(&mut Self) -> Result<(), E>,
+    ) -> Result<Self, E> {
+        let terms = terms.map(|terms| SparseTerms::new(structure.dictionary(), terms));
+        let terms = terms.transpose().map_err(ModelError::Sparse)?;
         let program = Program::new(&structure, terms)?;
         let pairs = ranges.map(|ranges| ranges.as_chunks().0);
-        let model =
+        let mut model =
             Self { structure, terms, program, coefficients, ranges: pairs, error_bounds: None };
         let structure = &model.structure;
         let expected = structure.outputs().saturating_mul(model.coefficients_per_output());
-        let mismatch =
-            |field, expected, found| Err(ModelError::DimensionMismatch { field, expected, found });
+        let mismatch = |field, expected, found| {
+            Err(ModelError::DimensionMismatch { field, expected, found }.into())
+        };
         if coefficients.len() != expected {
             return mismatch("coefficients", expected, coefficients.len());
         }
         if let Some(coefficient) = coefficients.iter().position(|c| !c.is_finite()) {
-            return Err(ModelError::NotFinite { coefficient });
+            return Err(ModelError::NotFinite { coefficient }.into());
         }
         if let Some(ranges) = ranges {
             let expected = structure.dictionary().observables().len().saturating_mul(2);
@@ -551,9 +566,12 @@ impl<'a, S: Scalar> Model<'a, S> {
                 .iter()
                 .position(|[low, high]| low.partial_cmp(high).is_none_or(Ordering::is_gt))
             {
-                return Err(ModelError::Number { field: "trained range of an observable", index });
+                return Err(
+                    ModelError::Number { field: "trained range of an observable", index }.into()
+                );
             }
         }
+        complete(&mut model)?;
         Ok(model)
     }
 
@@ -561,13 +579,23 @@ impl<'a, S: Scalar> Model<'a, S> {
     ///
     /// # Errors
     /// [`ModelError::DimensionMismatch`] if they are for another number of state coordinates.
-    pub fn with_error_bounds(self, error_bounds: ErrorBounds<'a>) -> Result<Self, ModelError> {
+    pub fn with_error_bounds(mut self, error_bounds: ErrorBounds<'a>) -> Result<Self, ModelError> {
+        self.set_error_bounds(error_bounds)?;
+        Ok(self)
+    }
+
+    /// The same in place.
+    pub(crate) fn set_error_bounds(
+        &mut self,
+        error_bounds: ErrorBounds<'a>,
+    ) -> Result<(), ModelError> {
         let (expected, found) = (self.structure.states().len(), error_bounds.states());
         if expected != found {
             let field = "states of the error bounds";
             return Err(ModelError::DimensionMismatch { field, expected, found });
         }
-        Ok(Self { error_bounds: Some(error_bounds), ..self })
+        self.error_bounds = Some(error_bounds);
+        Ok(())
     }
 
     /// Everything but the numbers.
