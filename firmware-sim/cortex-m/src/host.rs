@@ -3,16 +3,8 @@
 
 use cortex_m_semihosting::{nr::open::R_BINARY, syscall};
 
-/// What the emulator was asked for.
-pub enum Asked<'b> {
-    /// Semihosting arguments `list FILE`: the name of the file, with the zero behind it.
-    List(&'b [u8]),
-    /// `bits N`: the number.
-    Bits(u32),
-}
-
-/// What the emulator was asked for; `None` without arguments.
-pub fn asked(buffer: &mut [u8; 256]) -> Option<Asked<'_>> {
+/// What follows `command` in the emulator's semihosting arguments, with the zero behind it.
+pub fn argument<'b>(buffer: &'b mut [u8; 256], command: &[u8]) -> Option<&'b [u8]> {
     let mut block = [buffer.as_mut_ptr() as usize, buffer.len()];
     // SAFETY: the host writes at most `block[1]` bytes at `block[0]`, which is `buffer`, and then
     // the length into `block[1]`.
@@ -27,12 +19,7 @@ pub fn asked(buffer: &mut [u8; 256]) -> Option<Asked<'_>> {
     }
     let end = buffer.iter().position(|byte| *byte == 0)?;
     // Without arguments it is the name of the image.
-    let line = buffer.get(..=end)?;
-    if let Some(file) = line.strip_prefix(b"list ") {
-        return Some(Asked::List(file));
-    }
-    let (_, digits) = line.strip_prefix(b"bits ")?.split_last()?;
-    core::str::from_utf8(digits).ok()?.parse().ok().map(Asked::Bits)
+    buffer.get(..=end)?.strip_prefix(command)
 }
 
 /// A file of the host, open for reading.

@@ -23,10 +23,7 @@ use firmware_core::slots::sha256;
 use firmware_core::update::{Ask, MAX_CHUNK, PublicKey, Request, Trust};
 use firmware_core::{Model, Predictor, PredictorState};
 
-mod bits;
 mod host;
-
-use host::Asked;
 
 /// Repetitions that are counted together: a tick is then less than a hundredth of an instruction.
 const REPETITIONS: u32 = 1_000;
@@ -72,17 +69,6 @@ fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
 }
 
 fn measure() -> Option<()> {
-    let mut line = [0; 256];
-    let asked = host::asked(&mut line);
-    if let Some(Asked::Bits(steps)) = asked {
-        for blob in MODELS {
-            let model = parse(&blob.0).ok()?;
-            let (predicted, hash) = bits::bits(&model, steps)?;
-            let robot = model.structure().robot();
-            hprintln!("{} {} of {} {:016x}", robot, predicted, steps, hash);
-        }
-        return Some(());
-    }
     let mut timer = cortex_m::Peripherals::take()?.SYST;
     timer.set_clock_source(SystClkSource::Core);
     timer.set_reload(0x00FF_FFFF);
@@ -98,10 +84,8 @@ fn measure() -> Option<()> {
         per_tick
     );
     update(per_tick)?;
-    let list = match asked {
-        Some(Asked::List(file)) => host::File::open(file),
-        _ => None,
-    };
+    let mut line = [0; 256];
+    let list = host::argument(&mut line, b"list ").and_then(host::File::open);
     let Some(mut list) = list else {
         for (i, blob) in MODELS.iter().enumerate() {
             one(i, &blob.0, per_tick)?;

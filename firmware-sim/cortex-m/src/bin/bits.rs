@@ -1,0 +1,54 @@
+//! Predictions from random samples, as many as the semihosting argument `bits N` says, with each model of
+//! models/: `bits` in this folder compares them with the host's. It is an image of its own, because what else
+//! an image holds changes how the compiler makes the step that `measure` counts.
+#![no_std]
+#![no_main]
+
+use cortex_m_rt::entry;
+use cortex_m_semihosting::{debug, hprintln};
+use firmware_core::blob::{Aligned, parse};
+
+#[path = "../bits.rs"]
+mod bits;
+// A file of the host is nothing that is needed here.
+#[allow(dead_code)]
+#[path = "../host.rs"]
+mod host;
+
+static MODELS: [&Aligned<[u8]>; 4] = [
+    &Aligned(*include_bytes!("../../../../models/rosbot/model.bin")),
+    &Aligned(*include_bytes!("../../../../models/skid-rosbot/model.bin")),
+    &Aligned(*include_bytes!("../../../../models/soft-leg/model.bin")),
+    &Aligned(*include_bytes!("../../../../models/two-link-arm/model.bin")),
+];
+
+#[panic_handler]
+fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+    hprintln!("panic");
+    debug::exit(debug::EXIT_FAILURE);
+    loop {
+        cortex_m::asm::wfi();
+    }
+}
+
+#[entry]
+fn main() -> ! {
+    let ok = predict().is_some();
+    debug::exit(if ok { debug::EXIT_SUCCESS } else { debug::EXIT_FAILURE });
+    loop {
+        cortex_m::asm::wfi();
+    }
+}
+
+fn predict() -> Option<()> {
+    let mut line = [0; 256];
+    let (_, digits) = host::argument(&mut line, b"bits ")?.split_last()?;
+    let steps = core::str::from_utf8(digits).ok()?.parse().ok()?;
+    for blob in MODELS {
+        let model = parse(&blob.0).ok()?;
+        let (predicted, hash) = bits::bits(&model, steps)?;
+        let robot = model.structure().robot();
+        hprintln!("{} {} of {} {:016x}", robot, predicted, steps, hash);
+    }
+    Some(())
+}
