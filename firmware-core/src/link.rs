@@ -32,7 +32,7 @@ use serde::{Deserialize, Serialize};
 use crate::blob::CRC;
 use crate::capacity::MAX_INPUTS;
 use crate::control_loop::telemetry::{Frame, Frames};
-use crate::control_loop::{Command, ControlLoop, Mode};
+use crate::control_loop::{Command, ControlLoop};
 use crate::update::{Answer, Refused, Request, Say, Updates};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
@@ -250,8 +250,9 @@ impl Port {
     }
 
     /// Reads what has arrived, at most 128 bytes, and hands on commands to the loop, requests to the
-    /// updates; of what these have to do for long, a part, unless the robot runs. Between two ticks of a
-    /// robot at rest it may be called as often as there is time.
+    /// updates; of what these have to do for long, a part, once the robot is
+    /// [switched off](crate::control_loop::Supervisor::is_switched_off). Between two ticks of a robot at
+    /// rest it may be called as often as there is time.
     pub fn receive<const M: usize>(
         &mut self,
         serial: &mut (impl Read + ReadReady),
@@ -270,7 +271,7 @@ impl Port {
             self.answer(answer);
         }
         // Erasing may hold up the line: what has been said goes first.
-        if robot.mode() != Mode::Running && updates.is_working() && self.is_sent() {
+        if updates.is_working() && robot.supervisor().is_switched_off() && self.is_sent() {
             let answer = updates.work(robot.mode(), now_us);
             self.answer(answer);
             robot.supervisor_mut().pause();
@@ -354,6 +355,7 @@ impl Port {
 mod tests {
     extern crate std;
     use super::*;
+    use crate::control_loop::Mode;
     use proptest::prelude::*;
 
     fn full() -> Message {

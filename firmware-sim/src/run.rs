@@ -365,7 +365,7 @@ impl<R: Rig<N>, L: Laptop, const N: usize> World<'_, R, L, N> {
     fn leave_out(&mut self, mode: Mode) {
         let next = self.now_us().div_ceil(R::TICK_US);
         let left_out = next.saturating_sub(self.tick);
-        self.summary.left_out(mode, left_out);
+        self.summary.left_out(mode, left_out, self.rig.is_off());
         self.tick += left_out;
     }
 }
@@ -463,7 +463,8 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             let waited_us = world.now_us() - began_us;
             if waited_us > R::TICK_US / 4 {
                 // Something of an update took long: this tick is left out, and what else was due.
-                world.summary.left_out(firmware.mode(), 1);
+                let off = world.rig.is_off();
+                world.summary.left_out(firmware.mode(), 1, off);
                 world.leave_out(firmware.mode());
                 if world.tick >= ticks {
                     break 'boots;

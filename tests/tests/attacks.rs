@@ -645,3 +645,25 @@ fn a_session_that_says_nothing_ends_and_its_robot_can_be_used_again() {
     assert!(heard.frames.iter().any(|frame| frame.mode == Mode::Running));
     assert_eq!((summary.deadline_misses, summary.driven_at_rest), (0, 0));
 }
+
+#[test]
+fn the_motors_are_off_before_an_update_takes_its_time() {
+    let mut store = installed(5);
+    let new = blob("skid-rosbot");
+    let ask = update(&new, 6)[0].clone();
+    let mut both = vec![0; 2 * MAX_FRAME];
+    let stop = encode(&Message::Stop, &mut both).unwrap();
+    let request = Message::Request(Request { number: 0, ask });
+    let length = stop + encode(&request, &mut both[stop..]).unwrap();
+    // They are read together, and no tick comes between them.
+    assert!(length <= 128, "{length}");
+    both.truncate(length);
+    let drive = |_| Step::Command(Command::Inputs([6.0, 8.0]));
+    let mut steps = vec![Step::Wait(1_000_000), Step::Command(Command::Start)];
+    steps.extend((0..20).flat_map(|i| [drive(i), Step::Wait(50_000)]));
+    steps.push(Step::Bytes(both));
+    let (heard, summary) = go(&mut store, 8.0, &steps);
+    assert_eq!(heard.answers.last(), Some(&Some(Say::Begun { written: 0 })));
+    assert!(heard.frames.iter().any(|frame| frame.mode == Mode::Running));
+    assert_eq!((summary.driven_at_rest, summary.deadline_misses), (0, 0));
+}

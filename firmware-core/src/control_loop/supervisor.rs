@@ -248,6 +248,8 @@ pub struct Supervisor {
     worst_us: u32,
     /// Nothing leads out of Safe.
     held: bool,
+    /// The actuators have been switched off since the robot ran.
+    switched_off: bool,
 }
 
 impl Supervisor {
@@ -263,12 +265,19 @@ impl Supervisor {
             silent_ticks: 0,
             worst_us: 0,
             held: false,
+            switched_off: true,
         }
     }
 
     /// What the loop may do.
     pub fn mode(&self) -> Mode {
         self.mode
+    }
+
+    /// Whether the robot is at rest and its actuators have been switched off since it ran. Between a stop
+    /// and the end of the next tick they act as they did.
+    pub fn is_switched_off(&self) -> bool {
+        self.mode != Mode::Running && self.switched_off
     }
 
     /// What was noticed since the last start or reset.
@@ -359,6 +368,7 @@ impl Supervisor {
             // It may have been this once.
             let _ = actuators.stop();
         }
+        self.switched_off = self.mode != Mode::Running;
         self.mode
     }
 
@@ -382,6 +392,7 @@ impl Supervisor {
         if self.mode != Mode::Running && actuators.stop().is_err() {
             self.raise(Alarms::ACTUATOR);
         }
+        self.switched_off = self.mode != Mode::Running;
         self.mode
     }
 
@@ -412,6 +423,7 @@ impl Supervisor {
     pub fn start(&mut self) {
         if self.mode == Mode::Idle {
             self.mode = Mode::Running;
+            self.switched_off = false;
             self.alarms = Alarms::none();
             self.heard();
         }
