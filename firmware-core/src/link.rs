@@ -32,7 +32,7 @@ use serde::{Deserialize, Serialize};
 use crate::blob::CRC;
 use crate::capacity::MAX_INPUTS;
 use crate::control_loop::telemetry::{Frame, Frames};
-use crate::control_loop::{Command, ControlLoop};
+use crate::control_loop::{Command, ControlLoop, Mode};
 use crate::update::{Answer, Refused, Request, Say, Updates};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
@@ -270,8 +270,11 @@ impl Port {
             let answer = self.take(received, robot, updates, now_us);
             self.answer(answer);
         }
-        // Erasing may hold up the line: what has been said goes first.
-        if updates.is_working() && robot.supervisor().is_switched_off() && self.is_sent() {
+        // Erasing may hold up the line: what has been said goes first. What was asked before a start is
+        // not done after it, but given up at once.
+        let running = robot.mode() == Mode::Running;
+        let may_wait = robot.supervisor().is_switched_off() && self.is_sent();
+        if updates.is_working() && (running || may_wait) {
             let answer = updates.work(robot.mode(), now_us);
             self.answer(answer);
             robot.supervisor_mut().pause();
@@ -355,7 +358,6 @@ impl Port {
 mod tests {
     extern crate std;
     use super::*;
-    use crate::control_loop::Mode;
     use proptest::prelude::*;
 
     fn full() -> Message {

@@ -628,7 +628,8 @@ pub trait Updates {
     /// Whether there is something to do that takes long: only while the robot is at rest.
     fn is_working(&self) -> bool;
 
-    /// Does a part of it: checks a signature, erases a sector, writes a chunk, reads a blob back.
+    /// Does a part of it: checks a signature, erases a sector, writes a chunk, reads a blob back. Of a
+    /// robot that runs nothing is done, and what was asked is given up.
     fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer>;
 
     /// Whether the robot has to be [held](crate::control_loop::Supervisor::hold) in Safe.
@@ -836,6 +837,12 @@ where
         Ok(())
     }
 
+    /// Whether there is a model on trial, with enough good ticks.
+    fn may_confirm(&self) -> Result<(), Refused> {
+        let Trial { good, needed } = self.trial().ok_or(Refused::NotOnTrial)?;
+        if good < needed { Err(Refused::TooEarly { good, needed }) } else { Ok(()) }
+    }
+
     /// What can be said at once; `None` where there is something to do.
     fn at_once(&mut self, ask: &Ask, now_us: u64) -> Result<Option<Say>, Refused> {
         if self.resets && !matches!(ask, Ask::Activate { .. }) {
@@ -888,10 +895,7 @@ where
                 self.signed(signature, now_us)?;
             }
             Ask::Confirm { signature } => {
-                let Trial { good, needed } = self.trial().ok_or(Refused::NotOnTrial)?;
-                if good < needed {
-                    return Err(Refused::TooEarly { good, needed });
-                }
+                self.may_confirm()?;
                 self.signed(signature, now_us)?;
             }
             Ask::Abort { session, signature } => {
@@ -981,6 +985,8 @@ where
                 Ok(Say::Activated)
             }
             Ask::Confirm { signature } => {
+                // Ticks may have come since.
+                self.may_confirm()?;
                 let release = self.release;
                 self.check(Purpose::Confirm, &release, &signature)?;
                 self.slots.confirm().map_err(|error| match error {

@@ -1046,8 +1046,15 @@ fn requests_may_be_repeated_as_specified() {
     assert_eq!(controller.receive(6, &activate()), no_session);
 
     let early = Say::Refused(Refused::TooEarly { good: 0, needed: 3 });
-    assert_eq!(controller.receive(8, &confirm()), Some(early));
+    assert_eq!(controller.receive(8, &confirm()), Some(early.clone()));
     assert_eq!(controller.receive(8, &begin()), Some(Say::Refused(Refused::OnTrial)));
+    for _ in 0..3 {
+        controller.updater.ticked(Alarms::OUTLIER);
+    }
+    // A bad tick between question and answer.
+    assert_eq!(controller.receive(8, &confirm()), None);
+    controller.updater.ticked(Alarms::RESIDUAL);
+    assert_eq!(controller.work(), early);
     for _ in 0..3 {
         controller.updater.ticked(Alarms::OUTLIER);
     }
