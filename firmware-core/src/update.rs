@@ -632,7 +632,8 @@ pub trait Updates {
     /// robot that runs nothing is done, and what was asked is given up.
     fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer>;
 
-    /// Whether the robot has to be [held](crate::control_loop::Supervisor::hold) in Safe.
+    /// Whether the robot has to be [held](crate::control_loop::Supervisor::hold) in Safe; to be called
+    /// after [`work`](Self::work), with the same time.
     fn holds(&mut self, now_us: u64) -> bool;
 }
 
@@ -714,6 +715,8 @@ pub struct Updater<'r, F, T, A> {
     /// When the next signature may be looked at.
     pause_until_us: u64,
     wrong_signature: bool,
+    /// Some work was done, and nobody has looked at the clock since.
+    worked: bool,
     good: u32,
     resets: bool,
 }
@@ -743,7 +746,7 @@ where
         let factory = Release { length, sha256, sequence: 0, robot: robot(name) };
         let release = slots.release().unwrap_or(factory);
         let (session, job, pause_until_us) = (None, None, 0);
-        let (wrong_signature, good, resets) = (false, 0, false);
+        let (wrong_signature, worked, good, resets) = (false, false, 0, false);
         let updater = Self {
             slots,
             trust,
@@ -754,6 +757,7 @@ where
             job,
             pause_until_us,
             wrong_signature,
+            worked,
             good,
             resets,
         };
@@ -1086,11 +1090,15 @@ where
             // It could not be heard while this took its time.
             session.heard_us = None;
         }
+        self.worked = true;
         Some(Answer { number, say: result.unwrap_or_else(Say::Refused) })
     }
 
     fn holds(&mut self, now_us: u64) -> bool {
-        self.settle(now_us);
+        // Right after some work the time is that before it.
+        if !core::mem::take(&mut self.worked) {
+            self.settle(now_us);
+        }
         self.session.is_some()
     }
 }

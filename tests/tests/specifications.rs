@@ -1107,6 +1107,9 @@ fn sessions_and_pauses_last_as_specified() {
     controller.now_us += 10 * SILENCE_US;
     assert!(controller.updater.holds(controller.now_us), "it is worked on");
     assert_eq!(controller.work(), Say::Begun { written: 0 });
+    // The time before the work, that after it, and from there on.
+    assert!(controller.updater.holds(controller.now_us));
+    controller.now_us += 10 * SILENCE_US;
     assert!(controller.updater.holds(controller.now_us));
     controller.now_us += SILENCE_US;
     assert!(controller.updater.holds(controller.now_us));
