@@ -139,7 +139,8 @@
 //! updater.ticked(robot.alarms());
 //! port.send(&mut frames, &mut serial);
 //! if updater.resets() && port.is_sent() {
-//!     // Wait until the last byte is out, at most some milliseconds, and reset the controller.
+//!     // Wait until the last byte is out, at most some milliseconds, and reset the controller; also if
+//!     // the answers have not been sent after a second.
 //! }
 //! # let mut receiver = Receiver::new();
 //! # let said = serial.said.iter().filter_map(|byte| receiver.push(*byte)).last();
@@ -776,7 +777,8 @@ where
         self.good = if bad { 0 } else { self.good.saturating_add(1) };
     }
 
-    /// Whether the controller is to be reset, as soon as its answers are on the line.
+    /// Whether the controller is to be reset: as soon as its answers are on the line, or after a second
+    /// if that does not take them. Until then the robot is held.
     pub fn resets(&self) -> bool {
         self.resets
     }
@@ -1099,7 +1101,7 @@ where
         if !core::mem::take(&mut self.worked) {
             self.settle(now_us);
         }
-        self.session.is_some()
+        self.session.is_some() || self.resets
     }
 }
 

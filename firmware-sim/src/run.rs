@@ -63,6 +63,8 @@ const BROWN_OUT_VOLT: f64 = 2.7;
 const QUEUE: usize = 8;
 /// Time from one look at the line to the next while a model is being installed (µs).
 const POLL_US: u64 = 250;
+/// A reset waits at most so long until the answers are on the line (µs).
+const RESET_US: u64 = 1_000_000;
 /// Samples whose frames may be on their way, which is enough for a line of 100 baud. On a dead line the
 /// oldest are forgotten.
 const MOST_PENDING: usize = 4_096;
@@ -456,6 +458,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
         let booted = world.rig.boot(model, &world.faults, seed.wrapping_add(boots), telemetry);
         let mut firmware = booted.map_err(RunError::Firmware)?;
         let (mut port, mut of_boot) = (Port::new(), 0);
+        let mut resets_since_us = None;
         let mut was_on_trial = updates.as_ref().is_some_and(|u| u.slots().on_trial());
         loop {
             let mut began_us = world.now_us();
@@ -517,7 +520,11 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
                 {
                     store.save(installed)?;
                 }
-                if updater.resets() && port.is_sent() && serial.flush().is_ok() {
+                let is_sent = port.is_sent() && serial.flush().is_ok();
+                let now_us = world.now_us();
+                if updater.resets()
+                    && (is_sent || now_us - *resets_since_us.get_or_insert(now_us) > RESET_US)
+                {
                     world.rig.board().reset(ResetCause::Software);
                     break;
                 }

@@ -1041,6 +1041,8 @@ fn requests_may_be_repeated_as_specified() {
     assert_eq!(controller.twice(6, &activate()), Say::Activated);
     row(&activate(), "nothing", &controller.receive(6, &activate()).unwrap());
     assert_eq!(controller.receive(7, &verify()), Some(Say::Refused(Refused::Working)));
+    // However long the reset takes, nobody starts the robot before it.
+    assert!(controller.updater.holds(10 * SILENCE_US) && controller.updater.holds(20 * SILENCE_US));
     let mut controller = Controller::boot(&mut memory, Some(public()));
     let no_session = Some(Say::Refused(Refused::NoSession));
     assert_eq!(controller.receive(6, &activate()), no_session);
@@ -1246,6 +1248,26 @@ fn what_is_no_request_is_answered_as_specified() {
     ] {
         assert_eq!(said(&bytes), answer, "{what}");
     }
+}
+
+#[test]
+fn a_line_that_takes_nothing_holds_nobody_for_ever() {
+    let mut memory = Memory::new(4096);
+    let mut controller = Controller::boot(&mut memory, Some(public()));
+    let timing = Timing { period_us: 10_000, watchdog_us: 1_000_000 };
+    let (mut robot, mut port) = (Robot(Supervisor::new(timing)), Port::new());
+    let mut line = Line::default();
+    // Nothing that is said gets out; what is asked comes in.
+    line.0.extend(encoded(&request(1, begin())));
+    let mut held = 0;
+    for now_us in (0..60_000_000).step_by(10_000) {
+        port.receive(&mut line, &mut robot, &mut controller.updater, now_us);
+        robot.0.reset();
+        held += u32::from(robot.mode() == Mode::Safe);
+    }
+    assert!(!controller.updater.is_working());
+    assert!(held > 500, "{held} ticks: its session is as long as that of another");
+    assert!(held < 1500 && robot.mode() == Mode::Idle, "{held} ticks: it can be used again");
 }
 
 /// A flash in memory that is programmed in its units only, each of them once after an erase.
