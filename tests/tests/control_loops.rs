@@ -794,6 +794,8 @@ fn a_robot_at_rest_is_held_in_safe_and_a_running_one_is_not() {
         }
     }
     assert_eq!(supervisor.take_recent(), Alarms::UPDATE);
+    supervisor.hold(true);
+    assert_eq!(supervisor.take_recent(), Alarms::none(), "said once");
     // It took as long as it took.
     supervisor.pause();
     supervisor.begin(1_000_000);

@@ -248,7 +248,7 @@ pub struct Supervisor {
     worst_us: u32,
     /// Nothing leads out of Safe.
     held: bool,
-    /// The actuators have been switched off since the robot ran.
+    /// The actuators have been switched off since they acted.
     switched_off: bool,
 }
 
@@ -274,8 +274,8 @@ impl Supervisor {
         self.mode
     }
 
-    /// Whether the robot is at rest and its actuators have been switched off since it ran. Between a stop
-    /// and the end of the next tick they act as they did.
+    /// Whether the robot is at rest and its actuators have been switched off since they acted. Between a
+    /// stop and the next tick they act as they did.
     pub fn is_switched_off(&self) -> bool {
         self.mode != Mode::Running && self.switched_off
     }
@@ -424,7 +424,6 @@ impl Supervisor {
     pub fn start(&mut self) {
         if self.mode == Mode::Idle {
             self.mode = Mode::Running;
-            self.switched_off = false;
             self.alarms = Alarms::none();
             self.heard();
         }
