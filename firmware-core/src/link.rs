@@ -204,6 +204,8 @@ fn decode(frame: &mut [u8]) -> Option<Received> {
 const READ: usize = 128;
 /// Answers that wait to be sent; further ones are dropped, as the host asks again.
 const ANSWERS: usize = 2;
+/// What updates have to do waits at most so long until answers are on the line (µs).
+const SENT_US: u64 = 1_000_000;
 
 /// One end of the line at a controller: commands and requests in, answers and frames out, never waiting.
 #[derive(Clone, Debug)]
@@ -216,6 +218,8 @@ pub struct Port {
     sent: usize,
     /// Whether the last one was an answer: then it is the turn of a frame, however much is asked.
     answered: bool,
+    /// Since when there is something to do for updates.
+    works_since_us: Option<u64>,
     damaged: u32,
 }
 
@@ -235,6 +239,7 @@ impl Port {
             length: 0,
             sent: 0,
             answered: false,
+            works_since_us: None,
             damaged: 0,
         }
     }
@@ -244,14 +249,15 @@ impl Port {
         self.damaged
     }
 
-    /// Whether all answers have been handed to the line.
+    /// Whether all answers have been handed to the line. Of telemetry there may always be more.
     pub fn is_sent(&self) -> bool {
-        self.answers.is_empty() && self.sent == self.length
+        self.answers.is_empty() && (self.sent == self.length || !self.answered)
     }
 
     /// Reads what has arrived, at most 128 bytes, and hands on commands to the loop, requests to the
-    /// updates; of what these have to do for long, a part, unless the robot runs. Between two ticks of a
-    /// robot at rest it may be called as often as there is time.
+    /// updates; of what these have to do for long, a part, once the robot is
+    /// [switched off](crate::control_loop::Supervisor::is_switched_off). Between two ticks of a robot at
+    /// rest it may be called as often as there is time.
     pub fn receive<const M: usize>(
         &mut self,
         serial: &mut (impl Read + ReadReady),
@@ -269,13 +275,30 @@ impl Port {
             let answer = self.take(received, robot, updates, now_us);
             self.answer(answer);
         }
-        // Erasing may hold up the line: what has been said goes first.
-        if robot.mode() != Mode::Running && updates.is_working() && self.is_sent() {
+        if !updates.is_working() {
+            self.works_since_us = None;
+        } else if self.is_time_to_work(robot, now_us) {
+            self.works_since_us = None;
             let answer = updates.work(robot.mode(), now_us);
             self.answer(answer);
             robot.supervisor_mut().pause();
         }
         robot.supervisor_mut().hold(updates.holds(now_us));
+    }
+
+    fn is_time_to_work<const M: usize>(
+        &mut self,
+        robot: &(impl ControlLoop<M> + ?Sized),
+        now_us: u64,
+    ) -> bool {
+        // What was asked before a start is not done after it, but given up at once.
+        if robot.mode() == Mode::Running {
+            return true;
+        }
+        // Erasing may hold up the line: what has been said goes first, if the line takes it.
+        let since_us = *self.works_since_us.get_or_insert(now_us);
+        let is_patient = now_us.saturating_sub(since_us) <= SENT_US;
+        robot.supervisor().is_switched_off() && (self.is_sent() || !is_patient)
     }
 
     fn take<const M: usize>(

@@ -139,7 +139,8 @@
 //! updater.ticked(robot.alarms());
 //! port.send(&mut frames, &mut serial);
 //! if updater.resets() && port.is_sent() {
-//!     // Wait until the last byte is out, at most some milliseconds, and reset the controller.
+//!     // Wait until the last byte is out, at most some milliseconds, and reset the controller; also if
+//!     // the answers have not been sent after a second.
 //! }
 //! # let mut receiver = Receiver::new();
 //! # let said = serial.said.iter().filter_map(|byte| receiver.push(*byte)).last();
@@ -628,10 +629,12 @@ pub trait Updates {
     /// Whether there is something to do that takes long: only while the robot is at rest.
     fn is_working(&self) -> bool;
 
-    /// Does a part of it: checks a signature, erases a sector, writes a chunk, reads a blob back.
+    /// Does a part of it: checks a signature, erases a sector, writes a chunk, reads a blob back. Of a
+    /// robot that runs nothing is done, and what was asked is given up.
     fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer>;
 
-    /// Whether the robot has to be [held](crate::control_loop::Supervisor::hold) in Safe.
+    /// Whether the robot has to be [held](crate::control_loop::Supervisor::hold) in Safe; to be called
+    /// after [`work`](Self::work), with the same time.
     fn holds(&mut self, now_us: u64) -> bool;
 }
 
@@ -713,6 +716,8 @@ pub struct Updater<'r, F, T, A> {
     /// When the next signature may be looked at.
     pause_until_us: u64,
     wrong_signature: bool,
+    /// Some work was done, and nobody has looked at the clock since.
+    worked: bool,
     good: u32,
     resets: bool,
 }
@@ -742,7 +747,7 @@ where
         let factory = Release { length, sha256, sequence: 0, robot: robot(name) };
         let release = slots.release().unwrap_or(factory);
         let (session, job, pause_until_us) = (None, None, 0);
-        let (wrong_signature, good, resets) = (false, 0, false);
+        let (wrong_signature, worked, good, resets) = (false, false, 0, false);
         let updater = Self {
             slots,
             trust,
@@ -753,6 +758,7 @@ where
             job,
             pause_until_us,
             wrong_signature,
+            worked,
             good,
             resets,
         };
@@ -771,7 +777,8 @@ where
         self.good = if bad { 0 } else { self.good.saturating_add(1) };
     }
 
-    /// Whether the controller is to be reset, as soon as its answers are on the line.
+    /// Whether the controller is to be reset: as soon as its answers are on the line, or after a second
+    /// if that does not take them. Until then the robot is held.
     pub fn resets(&self) -> bool {
         self.resets
     }
@@ -836,6 +843,12 @@ where
         Ok(())
     }
 
+    /// Whether there is a model on trial, with enough good ticks.
+    fn may_confirm(&self) -> Result<(), Refused> {
+        let Trial { good, needed } = self.trial().ok_or(Refused::NotOnTrial)?;
+        if good < needed { Err(Refused::TooEarly { good, needed }) } else { Ok(()) }
+    }
+
     /// What can be said at once; `None` where there is something to do.
     fn at_once(&mut self, ask: &Ask, now_us: u64) -> Result<Option<Say>, Refused> {
         if self.resets && !matches!(ask, Ask::Activate { .. }) {
@@ -888,10 +901,7 @@ where
                 self.signed(signature, now_us)?;
             }
             Ask::Confirm { signature } => {
-                let Trial { good, needed } = self.trial().ok_or(Refused::NotOnTrial)?;
-                if good < needed {
-                    return Err(Refused::TooEarly { good, needed });
-                }
+                self.may_confirm()?;
                 self.signed(signature, now_us)?;
             }
             Ask::Abort { session, signature } => {
@@ -981,6 +991,8 @@ where
                 Ok(Say::Activated)
             }
             Ask::Confirm { signature } => {
+                // Ticks may have come since.
+                self.may_confirm()?;
                 let release = self.release;
                 self.check(Purpose::Confirm, &release, &signature)?;
                 self.slots.confirm().map_err(|error| match error {
@@ -1080,12 +1092,16 @@ where
             // It could not be heard while this took its time.
             session.heard_us = None;
         }
+        self.worked = true;
         Some(Answer { number, say: result.unwrap_or_else(Say::Refused) })
     }
 
     fn holds(&mut self, now_us: u64) -> bool {
-        self.settle(now_us);
-        self.session.is_some()
+        // Right after some work the time is that before it.
+        if !core::mem::take(&mut self.worked) {
+            self.settle(now_us);
+        }
+        self.session.is_some() || self.resets
     }
 }
 

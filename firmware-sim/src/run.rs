@@ -63,6 +63,8 @@ const BROWN_OUT_VOLT: f64 = 2.7;
 const QUEUE: usize = 8;
 /// Time from one look at the line to the next while a model is being installed (µs).
 const POLL_US: u64 = 250;
+/// A reset waits at most so long until the answers are on the line (µs).
+const RESET_US: u64 = 1_000_000;
 /// Samples whose frames may be on their way, which is enough for a line of 100 baud. On a dead line the
 /// oldest are forgotten.
 const MOST_PENDING: usize = 4_096;
@@ -365,7 +367,7 @@ impl<R: Rig<N>, L: Laptop, const N: usize> World<'_, R, L, N> {
     fn leave_out(&mut self, mode: Mode) {
         let next = self.now_us().div_ceil(R::TICK_US);
         let left_out = next.saturating_sub(self.tick);
-        self.summary.left_out(mode, left_out);
+        self.summary.left_out(mode, left_out, self.rig.is_off());
         self.tick += left_out;
     }
 }
@@ -456,6 +458,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
         let booted = world.rig.boot(model, &world.faults, seed.wrapping_add(boots), telemetry);
         let mut firmware = booted.map_err(RunError::Firmware)?;
         let (mut port, mut of_boot) = (Port::new(), 0);
+        let mut resets_since_us = None;
         let mut was_on_trial = updates.as_ref().is_some_and(|u| u.slots().on_trial());
         loop {
             let mut began_us = world.now_us();
@@ -463,7 +466,8 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             let waited_us = world.now_us() - began_us;
             if waited_us > R::TICK_US / 4 {
                 // Something of an update took long: this tick is left out, and what else was due.
-                world.summary.left_out(firmware.mode(), 1);
+                let off = world.rig.is_off();
+                world.summary.left_out(firmware.mode(), 1, off);
                 world.leave_out(firmware.mode());
                 if world.tick >= ticks {
                     break 'boots;
@@ -516,7 +520,11 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
                 {
                     store.save(installed)?;
                 }
-                if updater.resets() && port.is_sent() && serial.flush().is_ok() {
+                let is_sent = port.is_sent() && serial.flush().is_ok();
+                let now_us = world.now_us();
+                if updater.resets()
+                    && (is_sent || now_us - *resets_since_us.get_or_insert(now_us) > RESET_US)
+                {
                     world.rig.board().reset(ResetCause::Software);
                     break;
                 }

@@ -645,3 +645,54 @@ fn a_session_that_says_nothing_ends_and_its_robot_can_be_used_again() {
     assert!(heard.frames.iter().any(|frame| frame.mode == Mode::Running));
     assert_eq!((summary.deadline_misses, summary.driven_at_rest), (0, 0));
 }
+
+#[test]
+fn the_motors_are_off_before_an_update_takes_its_time() {
+    let mut store = installed(5);
+    let new = blob("skid-rosbot");
+    let ask = update(&new, 6)[0].clone();
+    let mut both = vec![0; 2 * MAX_FRAME];
+    let stop = encode(&Message::Stop, &mut both).unwrap();
+    let request = Message::Request(Request { number: 0, ask });
+    let length = stop + encode(&request, &mut both[stop..]).unwrap();
+    // They are read together, and no tick comes between them.
+    assert!(length <= 128, "{length}");
+    both.truncate(length);
+    let drive = |_| Step::Command(Command::Inputs([6.0, 8.0]));
+    let mut steps = vec![Step::Wait(1_000_000), Step::Command(Command::Start)];
+    steps.extend((0..20).flat_map(|i| [drive(i), Step::Wait(50_000)]));
+    steps.push(Step::Bytes(both));
+    let (heard, summary) = go(&mut store, 8.0, &steps);
+    assert_eq!(heard.answers.last(), Some(&Some(Say::Begun { written: 0 })));
+    assert!(heard.frames.iter().any(|frame| frame.mode == Mode::Running));
+    assert_eq!((summary.driven_at_rest, summary.deadline_misses), (0, 0));
+}
+
+#[test]
+fn what_was_asked_of_a_robot_that_is_started_is_not_done_later() {
+    let mut store = Store::new(&blob("skid-rosbot"), Some(key()));
+    let new = other_model();
+    let mut steps = ask(&update(&new, 5));
+    steps.push(Step::Wait(12_000_000));
+    // Enough good ticks; the start comes before the signature is looked at.
+    let signature = sign(&owner(), Purpose::Confirm, &release(&new, 5));
+    let mut both = vec![0; 2 * MAX_FRAME];
+    let request = Message::Request(Request { number: 0, ask: Ask::Confirm { signature } });
+    let length = encode(&request, &mut both).unwrap();
+    let end = length + encode(&Message::Start, &mut both[length..]).unwrap();
+    both.truncate(end);
+    steps.push(Step::Bytes(both));
+    steps.push(Step::Wait(300_000));
+    // Whoever drives it knows nothing of that.
+    steps.push(Step::Command(Command::Stop));
+    steps.push(Step::Wait(1_000_000));
+    steps.push(Step::Ask(Ask::Hello));
+    let (heard, summary) = go(&mut store, 30.0, &steps);
+    assert_eq!(heard.answers.len(), steps.len());
+    assert!(heard.frames.iter().any(|frame| frame.mode == Mode::Running));
+    let answer = &heard.answers[steps.len() - 5];
+    assert_eq!(*answer, Some(Say::Refused(Refused::Busy)));
+    let Some(Some(Say::Hello(hello))) = heard.answers.last() else { panic!("{:?}", heard.answers) };
+    assert!(hello.trial.is_some() && hello.floor == 0, "{hello:?}");
+    assert_eq!((summary.driven_at_rest, summary.deadline_misses), (0, 0));
+}

@@ -794,6 +794,8 @@ fn a_robot_at_rest_is_held_in_safe_and_a_running_one_is_not() {
         }
     }
     assert_eq!(supervisor.take_recent(), Alarms::UPDATE);
+    supervisor.hold(true);
+    assert_eq!(supervisor.take_recent(), Alarms::none(), "said once");
     // It took as long as it took.
     supervisor.pause();
     supervisor.begin(1_000_000);
@@ -806,6 +808,21 @@ fn a_robot_at_rest_is_held_in_safe_and_a_running_one_is_not() {
     supervisor.begin(2_000_000);
     // A running one is never late on purpose.
     assert_eq!((supervisor.mode(), supervisor.alarms()), (Mode::Safe, Alarms::LATE));
+}
+
+#[test]
+fn a_robot_that_starts_right_after_a_pause_runs() {
+    let mut supervisor = Supervisor::new(Timing { period_us: 10, watchdog_us: 1000 });
+    supervisor.begin(1_000_000);
+    supervisor.pause();
+    supervisor.start();
+    for now_us in (2_000_000..=2_001_000).step_by(10) {
+        assert_eq!((supervisor.mode(), supervisor.alarms()), (Mode::Running, Alarms::none()));
+        supervisor.begin(now_us);
+    }
+    // Its watchdog counts from the first tick.
+    supervisor.begin(2_001_010);
+    assert_eq!((supervisor.mode(), supervisor.alarms()), (Mode::Safe, Alarms::HOST_SILENT));
 }
 
 #[test]

@@ -648,6 +648,25 @@ fn a_slow_line_is_not_flooded() {
     }
 }
 
+/// There is always a frame of telemetry that waits for the line.
+#[test]
+fn a_line_that_telemetry_fills_takes_an_update() {
+    let blob = Blob::read("rosbot");
+    let owner = key(1);
+    let (model, signed) = (blob.model(), sign(&blob, 3, &owner));
+    let place = Place::new(&blob, Some(owner.public()));
+    let mut queue = Queue::new();
+    let mut controller = Controller::new(&place, &mut queue);
+    let options = Options { baud: Some(2400), ..options(1) };
+    let flashing = Flashing::new(blob.bytes(), &model, Some(&signed), options);
+    let lines = [&mut Line::at(2400), &mut Line::at(2400)];
+    let went = flash(&mut controller, lines, flashing, &mut |_, _, _| {});
+    assert!(controller.robot.telemetry.dropped() > 10, "the line is full");
+    assert_eq!(went.result, Ok(Outcome::Installed), "{went:?}");
+    drop(controller);
+    assert!(place.runs().0 == blob.bytes());
+}
+
 #[test]
 fn a_cut_line_is_gone_on_with_where_it_ended() {
     let blob = Blob::read("two-link-arm");

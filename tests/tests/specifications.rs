@@ -11,7 +11,9 @@ use embedded_storage::nor_flash::{
 };
 use firmware_core::capacity::{MAX_INPUTS, MAX_STATES};
 use firmware_core::control_loop::telemetry::Queue;
-use firmware_core::control_loop::{Alarms, Command, ControlLoop, Frame, Mode, Supervisor, Timing};
+use firmware_core::control_loop::{
+    Alarms, Command, ControlLoop, Frame, Mode, Supervisor, Telemetry, Timing,
+};
 use firmware_core::link::{MAX_FRAME, Message, Port, Received, Receiver, encode};
 use firmware_core::slots::{
     Boot, Geometry, MAX_WRITE_SIZE, PAYLOAD_OFFSET, Payload, Refusal, Release, Slots, VERSION,
@@ -1041,15 +1043,26 @@ fn requests_may_be_repeated_as_specified() {
     assert_eq!(controller.twice(6, &activate()), Say::Activated);
     row(&activate(), "nothing", &controller.receive(6, &activate()).unwrap());
     assert_eq!(controller.receive(7, &verify()), Some(Say::Refused(Refused::Working)));
+    // However long the reset takes, nobody starts the robot before it.
+    assert!(controller.updater.holds(10 * SILENCE_US) && controller.updater.holds(20 * SILENCE_US));
     let mut controller = Controller::boot(&mut memory, Some(public()));
     let no_session = Some(Say::Refused(Refused::NoSession));
     assert_eq!(controller.receive(6, &activate()), no_session);
 
     let early = Say::Refused(Refused::TooEarly { good: 0, needed: 3 });
-    assert_eq!(controller.receive(8, &confirm()), Some(early));
+    assert_eq!(controller.receive(8, &confirm()), Some(early.clone()));
     assert_eq!(controller.receive(8, &begin()), Some(Say::Refused(Refused::OnTrial)));
     for _ in 0..3 {
         controller.updater.ticked(Alarms::OUTLIER);
+    }
+    // A bad tick between question and answer.
+    for bad in [Alarms::RESIDUAL, Alarms::LATE] {
+        assert_eq!(controller.receive(8, &confirm()), None);
+        controller.updater.ticked(bad);
+        assert_eq!(controller.work(), early);
+        for _ in 0..3 {
+            controller.updater.ticked(Alarms::OUTLIER);
+        }
     }
     assert_eq!(controller.twice(9, &confirm()), Say::Confirmed);
     row(&confirm(), "nothing", &controller.receive(9, &confirm()).unwrap());
@@ -1097,9 +1110,14 @@ fn sessions_and_pauses_last_as_specified() {
     assert_eq!(controller.ask(2, &begin()), pause);
     controller.now_us = SIGNATURE_PAUSE_US;
     assert_eq!(controller.ask(2, &begin()), Say::Working { most_ms: 6000 });
-    controller.now_us += 10 * SILENCE_US;
-    assert!(controller.updater.holds(controller.now_us), "it is worked on");
+    for _ in 0..3 {
+        controller.now_us += 10 * SILENCE_US;
+        assert!(controller.updater.holds(controller.now_us), "it is worked on");
+    }
     assert_eq!(controller.work(), Say::Begun { written: 0 });
+    // The time before the work, that after it, and from there on.
+    assert!(controller.updater.holds(controller.now_us));
+    controller.now_us += 10 * SILENCE_US;
     assert!(controller.updater.holds(controller.now_us));
     controller.now_us += SILENCE_US;
     assert!(controller.updater.holds(controller.now_us));
@@ -1117,6 +1135,73 @@ fn sessions_and_pauses_last_as_specified() {
     assert_eq!(said, Say::Written { written: 7 });
     assert_eq!(controller.ask(7, &Ask::Verify { session: 2 }), Say::Refused(Refused::Hash));
     assert!(!controller.updater.holds(controller.now_us));
+}
+
+#[test]
+fn a_session_goes_on_anew_or_ends_with_what_is_signed_for_that() {
+    let mut memory = Memory::new(4096);
+    let mut controller = Controller::boot(&mut memory, Some(public()));
+    let (working, begun) = (Say::Working { most_ms: 6000 }, Say::Begun { written: 0 });
+    let wrong = Say::Refused(Refused::Signature);
+    assert_eq!(controller.ask(1, &begin()), working);
+    // Whoever has not held the robot yet does not get it erased.
+    controller.mode = Mode::Idle;
+    for _ in 0..3 {
+        assert_eq!(controller.updater.work(controller.mode, controller.now_us), None);
+        assert!(controller.updater.is_working());
+    }
+    controller.mode = Mode::Safe;
+    assert_eq!(controller.work(), begun);
+    let chunk = |offset, bytes: &[u8]| Ask::Chunk {
+        session: SESSION,
+        offset,
+        bytes: bytes.iter().copied().collect(),
+    };
+    // Too much, and then all but one.
+    let out_of_order = Say::Refused(Refused::OutOfOrder { written: 0 });
+    assert_eq!(controller.ask(2, &chunk(0, b"koopman!")), out_of_order);
+    assert_eq!(controller.ask(3, &chunk(0, b"koopma")), Say::Written { written: 6 });
+    // What is answered at once is heard, too.
+    assert!(controller.updater.holds(controller.now_us) && controller.updater.holds(0));
+    for number in 4..8 {
+        controller.now_us += SILENCE_US;
+        assert_eq!(controller.ask(number, &chunk(6, b"")), Say::Written { written: 6 });
+    }
+
+    // Another release, in the same session: signed as the first one was, and on an erased slot.
+    let next = Release { sequence: SEQUENCE + 1, ..release() };
+    let of_next = |signature| Ask::Begin { session: SESSION, release: next, signature };
+    assert_eq!(controller.ask(8, &of_next(signed(Purpose::Install))), wrong);
+    assert!(controller.updater.holds(controller.now_us));
+    assert!(controller.updater.holds(controller.now_us));
+    controller.now_us += SIGNATURE_PAUSE_US;
+    let sign = |purpose| {
+        keys().sk.sign(statement(purpose, &next), None).iter().copied().collect::<Signature>()
+    };
+    assert_eq!(controller.ask(9, &of_next(sign(Purpose::Install))), working);
+    assert_eq!(controller.work(), begun);
+
+    for purpose in [Purpose::Install, Purpose::Activate, Purpose::Confirm, Purpose::Abort] {
+        let signature = sign(purpose);
+        let said = controller.ask(10, &Ask::Abort { session: SESSION, signature });
+        let over = purpose == Purpose::Abort;
+        assert_eq!(said, if over { Say::Aborted } else { wrong.clone() }, "{purpose:?}");
+        controller.updater.holds(controller.now_us);
+        assert_eq!(controller.updater.holds(controller.now_us), !over);
+        controller.now_us += SIGNATURE_PAUSE_US;
+    }
+
+    // A flash that fails ends it, too.
+    let mut memory = Memory::new(4096);
+    memory.broken.insert(320 / 4);
+    memory.reports = true;
+    let mut controller = Controller::boot(&mut memory, Some(public()));
+    controller.ask(1, &begin());
+    assert_eq!(controller.work(), begun);
+    assert_eq!(controller.ask(2, &self::chunk()), Say::Written { written: 7 });
+    assert!(controller.updater.holds(0));
+    assert_eq!(controller.ask(3, &verify()), Say::Refused(Refused::Flash));
+    assert!(!controller.updater.holds(0));
 }
 
 /// A robot that does nothing, and its line.
@@ -1236,6 +1321,45 @@ fn what_is_no_request_is_answered_as_specified() {
     ] {
         assert_eq!(said(&bytes), answer, "{what}");
     }
+}
+
+#[test]
+fn telemetry_goes_on_however_much_is_asked() {
+    let timing = Timing { period_us: 10_000, watchdog_us: 1_000_000 };
+    let (mut robot, mut port) = (Robot(Supervisor::new(timing)), Port::new());
+    let mut line = Line::default();
+    let mut queue = Queue::<4>::new();
+    let (producer, mut frames) = queue.split();
+    let mut telemetry = Telemetry::new(producer);
+    for _ in 0..50 {
+        telemetry.send(Frame::default());
+        line.0.extend(encoded(&request(1, Ask::Hello)).repeat(10));
+        port.receive(&mut line, &mut robot, &mut NoUpdates, 0);
+        port.send(&mut frames, &mut line);
+    }
+    let said = received(&line.1);
+    let is_frame = |said: &&Received| matches!(said, Received::Message(Message::Frame(_)));
+    assert_eq!((said.len(), said.iter().filter(is_frame).count()), (100, 50));
+}
+
+#[test]
+fn a_line_that_takes_nothing_holds_nobody_for_ever() {
+    let mut memory = Memory::new(4096);
+    let mut controller = Controller::boot(&mut memory, Some(public()));
+    let timing = Timing { period_us: 10_000, watchdog_us: 1_000_000 };
+    let (mut robot, mut port) = (Robot(Supervisor::new(timing)), Port::new());
+    let mut line = Line::default();
+    // Nothing that is said gets out; what is asked comes in.
+    line.0.extend(encoded(&request(1, begin())));
+    let mut held = 0;
+    for now_us in (0..60_000_000).step_by(10_000) {
+        port.receive(&mut line, &mut robot, &mut controller.updater, now_us);
+        robot.0.reset();
+        held += u32::from(robot.mode() == Mode::Safe);
+    }
+    assert!(!controller.updater.is_working());
+    assert!(held > 500, "{held} ticks: its session is as long as that of another");
+    assert!(held < 1500 && robot.mode() == Mode::Idle, "{held} ticks: it can be used again");
 }
 
 /// A flash in memory that is programmed in its units only, each of them once after an erase.

@@ -306,6 +306,16 @@ fn the_session_lives_through_an_erase_of_four_seconds() {
 }
 
 #[test]
+fn a_session_lives_through_an_erase_that_takes_longer_than_it_may_be_silent() {
+    let mut store = Store::new(&factory(), None);
+    store.erase_ns = Some(7_000_000_000);
+    let blob = dense([3, 3, 3, 4]);
+    let (seen, _) = install(&mut store, &blob, Trouble::default(), 60.0, 1);
+    assert_eq!(seen.result, Some(Ok(Outcome::Installed)), "{:?}", seen.phases);
+    assert_eq!(seen.phases.iter().filter(|(_, phase)| *phase == Phase::Beginning).count(), 1);
+}
+
+#[test]
 fn a_model_of_four_kilobytes_arrives_on_a_noisy_line() {
     let blob = dense([3, 3, 3, 4]);
     assert!((4_000..4_400).contains(&blob.bytes().len()), "{} bytes", blob.bytes().len());

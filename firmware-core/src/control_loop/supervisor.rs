@@ -241,13 +241,15 @@ pub struct Supervisor {
     recent: Alarms,
     /// When the last tick began.
     began_us: Option<u64>,
-    /// When the host was last heard, by the clock of the ticks.
-    heard_us: u64,
+    /// When the host was last heard, by the clock of the ticks; `None`: the next one says.
+    heard_us: Option<u64>,
     /// Ticks since then: they count on when the clock does not.
     silent_ticks: u32,
     worst_us: u32,
     /// Nothing leads out of Safe.
     held: bool,
+    /// The actuators have been switched off since they acted.
+    switched_off: bool,
 }
 
 impl Supervisor {
@@ -259,16 +261,23 @@ impl Supervisor {
             alarms: Alarms::none(),
             recent: Alarms::none(),
             began_us: None,
-            heard_us: 0,
+            heard_us: None,
             silent_ticks: 0,
             worst_us: 0,
             held: false,
+            switched_off: true,
         }
     }
 
     /// What the loop may do.
     pub fn mode(&self) -> Mode {
         self.mode
+    }
+
+    /// Whether the robot is at rest and its actuators have been switched off since they acted. Between a
+    /// stop and the next tick they act as they did.
+    pub fn is_switched_off(&self) -> bool {
+        self.mode != Mode::Running && self.switched_off
     }
 
     /// What was noticed since the last start or reset.
@@ -290,7 +299,8 @@ impl Supervisor {
         if self.mode == Mode::Running {
             self.silent_ticks = self.silent_ticks.saturating_add(1);
             let ticked_us = u64::from(self.silent_ticks) * u64::from(self.timing.period_us);
-            let silent_us = now_us.saturating_sub(self.heard_us).max(ticked_us);
+            let heard_us = *self.heard_us.get_or_insert(now_us);
+            let silent_us = now_us.saturating_sub(heard_us).max(ticked_us);
             if silent_us > u64::from(self.timing.watchdog_us) {
                 self.raise(Alarms::HOST_SILENT);
             }
@@ -359,6 +369,7 @@ impl Supervisor {
             // It may have been this once.
             let _ = actuators.stop();
         }
+        self.switched_off = self.mode != Mode::Running;
         self.mode
     }
 
@@ -382,6 +393,7 @@ impl Supervisor {
         if self.mode != Mode::Running && actuators.stop().is_err() {
             self.raise(Alarms::ACTUATOR);
         }
+        self.switched_off = self.mode != Mode::Running;
         self.mode
     }
 
@@ -404,7 +416,7 @@ impl Supervisor {
 
     /// The host is alive.
     pub fn heard(&mut self) {
-        self.heard_us = self.began_us.unwrap_or(0);
+        self.heard_us = self.began_us;
         self.silent_ticks = 0;
     }
 

@@ -260,8 +260,11 @@ impl<const N: usize> Watch<N> {
     }
 
     /// Ticks were left out while the robot was at rest.
-    pub(crate) fn left_out(&mut self, mode: Mode, ticks: u64) {
+    pub(crate) fn left_out(&mut self, mode: Mode, ticks: u64, off: bool) {
         self.ticks[number(mode)] += ticks;
+        if !off {
+            self.summary.driven_at_rest += ticks;
+        }
     }
 
     /// The microcontroller has no supply.

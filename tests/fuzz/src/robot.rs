@@ -1,6 +1,20 @@
 //! A loop that does nothing but follow its host.
 
-use firmware_core::control_loop::{Command, ControlLoop, Mode, Supervisor, Timing};
+use firmware_core::control_loop::{
+    ActuatorError, Actuators, Command, ControlLoop, Mode, Supervisor, Timing,
+};
+
+struct Nothing;
+
+impl Actuators<2> for Nothing {
+    fn apply(&mut self, _: [f32; 2]) -> Result<(), ActuatorError> {
+        Ok(())
+    }
+
+    fn stop(&mut self) -> Result<(), ActuatorError> {
+        Ok(())
+    }
+}
 
 /// A robot without actuators.
 pub struct Robot {
@@ -32,8 +46,8 @@ impl ControlLoop<2> for Robot {
         self.mode()
     }
 
-    fn finish(&mut self, _: u64) -> Mode {
-        self.mode()
+    fn finish(&mut self, now_us: u64) -> Mode {
+        self.supervisor.finish(now_us, &mut Nothing)
     }
 
     fn path(&self) -> &[f32] {

@@ -338,6 +338,7 @@ fn boot(flash: &Flash, signed: &[Signed], allowed: &mut Allowed, input: &mut Inp
             port.receive(&mut line, &mut robot, &mut updater, now_us);
             let mut out = Vec::new();
             port.send(&mut frames, &mut Out(&mut out));
+            robot.finish(now_us);
             assert!(out.len() <= 2 * firmware_core::link::MAX_FRAME);
         }
         if was == Mode::Running {
