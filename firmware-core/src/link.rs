@@ -27,6 +27,7 @@
 
 use embedded_io::{Read, ReadReady, Write, WriteReady};
 use heapless::{Deque, Vec};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::CRC;
@@ -40,8 +41,12 @@ use crate::update::{Answer, Refused, Request, Say, Updates};
 pub const MAX_FRAME: usize = 256;
 /// Number of [`Message::Inputs`].
 const INPUTS: u8 = 3;
+/// Number of [`Message::Frame`].
+const FRAME: u8 = 4;
 /// Number of [`Message::Request`].
 pub(crate) const REQUEST: u8 = 5;
+/// Number of [`Message::Answer`].
+const ANSWER: u8 = 6;
 
 /// What goes over the line.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -106,6 +111,10 @@ impl Message {
 /// # Errors
 /// [`TooLong`] when `out` has no room for it; [`MAX_FRAME`] bytes always are enough.
 pub fn encode(message: &Message, out: &mut [u8]) -> Result<usize, TooLong> {
+    encode_as(message, out)
+}
+
+fn encode_as(message: &impl Serialize, out: &mut [u8]) -> Result<usize, TooLong> {
     let mut plain = [0; MAX_FRAME];
     let length = postcard::to_slice(message, &mut plain).map_err(|_| TooLong)?.len();
     let check = CRC.checksum(plain.get(..length).unwrap_or(&[]));
@@ -124,9 +133,9 @@ pub struct TooLong;
 /// What a byte completed.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(clippy::large_enum_variant)]
-pub enum Received {
+pub enum Received<M = Message> {
     /// A message.
-    Message(Message),
+    Message(M),
     /// A frame with a right checksum that holds no message known here.
     Unknown {
         /// Its first byte.
@@ -161,6 +170,10 @@ impl Receiver {
 
     /// Takes a byte; every zero but those that follow another one completes something.
     pub fn push(&mut self, byte: u8) -> Option<Received> {
+        self.push_as(byte)
+    }
+
+    fn push_as<M: DeserializeOwned>(&mut self, byte: u8) -> Option<Received<M>> {
         if byte != 0 {
             if let Some(place) = self.frame.get_mut(self.length) {
                 *place = byte;
@@ -182,7 +195,7 @@ impl Receiver {
 }
 
 /// What a frame without its final zero holds; `None` of one that is damaged.
-fn decode(frame: &mut [u8]) -> Option<Received> {
+fn decode<M: DeserializeOwned>(frame: &mut [u8]) -> Option<Received<M>> {
     let length = cobs::decode_in_place(frame).ok()?;
     let (body, check) = frame.get(..length)?.split_last_chunk::<4>()?;
     if CRC.checksum(body) != u32::from_le_bytes(*check) {
@@ -198,6 +211,32 @@ fn decode(frame: &mut [u8]) -> Option<Received> {
         },
         |(message, _)| Received::Message(message),
     ))
+}
+
+/// What a controller reads: [`Message`] without what is for the host, of which only the number is left.
+#[derive(Deserialize)]
+#[allow(clippy::large_enum_variant)]
+enum Incoming {
+    Start,
+    Stop,
+    Reset,
+    Inputs(Vec<f32, MAX_INPUTS>),
+    Frame,
+    Request(Request),
+    Answer,
+}
+
+/// What a controller sends, numbered as in [`Message`].
+#[derive(Serialize)]
+#[allow(dead_code, clippy::large_enum_variant)]
+enum Outgoing {
+    Start,
+    Stop,
+    Reset,
+    Inputs,
+    Frame(Frame),
+    Request,
+    Answer(Answer),
 }
 
 /// Reads at most this many bytes per call: bounded work, whatever the line brings.
@@ -271,7 +310,7 @@ impl Port {
             _ => 0,
         };
         for byte in bytes.iter().take(count) {
-            let Some(received) = self.receiver.push(*byte) else { continue };
+            let Some(received) = self.receiver.push_as(*byte) else { continue };
             let answer = self.take(received, robot, updates, now_us);
             self.answer(answer);
         }
@@ -303,26 +342,33 @@ impl Port {
 
     fn take<const M: usize>(
         &mut self,
-        received: Received,
+        received: Received<Incoming>,
         robot: &mut (impl ControlLoop<M> + ?Sized),
         updates: &mut impl Updates,
         now_us: u64,
     ) -> Option<Answer> {
         let refused = |number, refused| Some(Answer { number, say: Say::Refused(refused) });
-        let understood = match &received {
-            Received::Message(Message::Request(request)) => {
-                return updates.receive(request, robot.mode(), now_us);
+        let command = match received {
+            Received::Message(Incoming::Request(request)) => {
+                return updates.receive(&request, robot.mode(), now_us);
             }
-            Received::Message(message) => message.command().map(|wanted| robot.command(wanted)),
+            Received::Message(Incoming::Start) => Some(Command::Start),
+            Received::Message(Incoming::Stop) => Some(Command::Stop),
+            Received::Message(Incoming::Reset) => Some(Command::Reset),
+            Received::Message(Incoming::Inputs(ref inputs)) => {
+                inputs.as_slice().try_into().ok().map(Command::Inputs)
+            }
             _ => None,
         };
-        if understood.is_some() {
+        if let Some(command) = command {
+            robot.command(command);
             return None;
         }
         self.damaged = self.damaged.saturating_add(1);
         match received {
             // For the host: an echo, or another controller, which would answer in its turn, for ever.
-            Received::Message(Message::Frame(_) | Message::Answer(_)) => None,
+            Received::Message(Incoming::Frame | Incoming::Answer)
+            | Received::Unknown { variant: FRAME | ANSWER, .. } => None,
             // Its number of inputs is another.
             Received::Message(_) => refused(0, Refused::Unknown { variant: INPUTS }),
             Received::Unknown { variant, number } => refused(number, Refused::Unknown { variant }),
@@ -349,13 +395,12 @@ impl Port {
                 let waits = self.answered && frames.ready();
                 let answer = if waits { None } else { self.answers.pop_front() };
                 self.answered = answer.is_some();
-                let message = answer.map(Message::Answer);
-                let Some(message) = message.or_else(|| frames.dequeue().map(Message::Frame)) else {
-                    return;
-                };
+                let message = answer.map(Outgoing::Answer);
+                let message = message.or_else(|| frames.dequeue().map(Outgoing::Frame));
+                let Some(message) = message else { return };
                 (self.sent, self.length) = (0, 0);
                 // There is room for every message.
-                self.length = encode(&message, &mut self.out).unwrap_or(0);
+                self.length = encode_as(&message, &mut self.out).unwrap_or(0);
             }
             while let Some(rest) = self.out.get(self.sent..self.length).filter(|r| !r.is_empty()) {
                 if !matches!(serial.write_ready(), Ok(true)) {
