@@ -8,8 +8,8 @@
 //! Erasing stalls most controllers for as long as seconds, programming for microseconds. When that is
 //! allowed is the caller's business, which [`update`](crate::update) minds: call [`erase`](Slots::erase),
 //! [`write`](Slots::write), [`verify`](Slots::verify), [`commit`](Slots::commit),
-//! [`confirm`](Slots::confirm) and [`abort`](Slots::abort) only while the actuators are switched off, the
-//! loop being in Safe.
+//! [`confirm`](Slots::confirm) and [`abort`](Slots::abort) only while the actuators are switched off: the
+//! loop held in Safe, or, to confirm, at rest.
 //!
 //! A slot begins with a header of 64 bytes, four marks of two cells each, and, at 320, the payload; the layout is
 //! the same on every flash. Every field, the states of a slot, how a boot decides, and why a power cut

@@ -956,6 +956,8 @@ fn a_model_that_does_not_come_up_is_reported() {
     let alarm = Alarms::RESIDUAL;
     let (went, runs) = run(&mut |_, controller, _| controller.robot.supervisor.raise(alarm));
     assert!(runs == FACTORY);
+    let message = went.result.as_ref().unwrap_err().to_string();
+    assert!(message.contains("stay until the robot is reset or started"), "{message}");
     let Err(FlashError::TrialStalls { good, needed }) = went.result else { panic!("{went:?}") };
     assert!(good < 10 && needed == GOOD_TICKS, "{good} of {needed}");
     // It never comes back; switched off and on it runs the new one, on trial.

@@ -198,8 +198,8 @@ pub enum FlashError {
     /// The model on trial does not do well.
     #[error(
         "the trial does not go on: {good} of {needed} good ticks in a row, and no more for {} s; look at the \
-         alarms with `trainer monitor`, mend what they say and run the same command again, or restart the \
-         controller, which drops the model", PATIENCE_US / 1_000_000
+         alarms with `trainer monitor` and mend what they say; they stay until the robot is reset or \
+         started; then run the same command again, or restart the controller, which drops the model", PATIENCE_US / 1_000_000
     )]
     TrialStalls {
         /// Good ticks in a row that were seen last.
