@@ -793,7 +793,9 @@ impl<F: NorFlash> Slots<F> {
             |running| running.side.other(),
         );
         let generations = [a, b].into_iter().flatten().map(|record| record.header.generation);
-        let generation = generations.max().unwrap_or(0).saturating_add(1);
+        // That of what runs, even if it cannot be read just now.
+        let known = self.running.map_or(0, |running| running.header.generation);
+        let generation = generations.max().unwrap_or(0).max(known).saturating_add(1);
         self.update = Some(Update {
             side,
             header: Header { length, sequence, generation, robot, sha256 },

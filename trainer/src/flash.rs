@@ -54,6 +54,8 @@ const FAILURES: u32 = 2;
 const SUCCESSES: u32 = 8;
 /// How often an update begins again whose session is over.
 const MOST_BEGINS: u32 = 16;
+/// How often a session may be over where the model should have been activated.
+const MOST_LOST: u32 = 3;
 /// How often a trial may stumble and still be waited for.
 const MOST_STUMBLES: u32 = 10;
 /// Longest time to erase a slot that is believed (µs).
@@ -423,6 +425,8 @@ pub struct Flashing<'m> {
     deadline_us: u64,
     in_use_us: Option<u64>,
     begins: u32,
+    /// How often a session was over when it should have been activated.
+    lost: u32,
     /// The robot is to be stopped.
     stops: bool,
     written: u32,
@@ -481,6 +485,7 @@ impl<'m> Flashing<'m> {
             deadline_us: u64::MAX,
             in_use_us: None,
             begins: 0,
+            lost: 0,
             stops: false,
             written: 0,
             most_written: 0,
@@ -700,7 +705,14 @@ impl<'m> Flashing<'m> {
                 self.go(Step::Restart, now_us);
             }
             // The session ended before the model was committed.
-            (Step::Reset, Refused::NoSession) => self.begin_again(now_us)?,
+            (Step::Reset, Refused::NoSession) => {
+                self.lost += 1;
+                // Or the answer was lost, and the boot did not accept it: over and over.
+                if let (true, Some(hello)) = (self.lost > MOST_LOST, &self.hello[1]) {
+                    return Err(FlashError::Dropped(hello.release));
+                }
+                self.begin_again(now_us)?;
+            }
             (Step::Reset, Refused::Working) => {
                 self.go(Step::Restart, now_us);
                 self.wait(AGAIN_US, now_us);

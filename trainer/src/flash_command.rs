@@ -82,6 +82,11 @@ fn run(
             Ok(read) => count = read,
             Err(_) if matches!(phase, Phase::Activating | Phase::Restarting) => port = None,
             Err(e) if written == 0 => return Err(failed(&e)),
+            Err(e) if matches!(phase, Phase::Trial(_) | Phase::Confirming) => {
+                return Err(failed(&format!(
+                    "{e}; the model is on trial, and the same command confirms it"
+                )));
+            }
             Err(e) => {
                 return Err(failed(&format!("{e}; the same command goes on at byte {written}")));
             }

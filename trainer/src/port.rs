@@ -81,9 +81,11 @@ impl Port {
                 stream.set_read_timeout(Some(patience)).and_then(|()| stream.read(bytes))
             }
         };
+        // A signal is no answer, and no failure.
+        let nothing = [ErrorKind::TimedOut, ErrorKind::WouldBlock, ErrorKind::Interrupted];
         match read {
             Ok(0) => Err(io::Error::new(ErrorKind::UnexpectedEof, "the other end has hung up")),
-            Err(e) if [ErrorKind::TimedOut, ErrorKind::WouldBlock].contains(&e.kind()) => Ok(0),
+            Err(e) if nothing.contains(&e.kind()) => Ok(0),
             read => read,
         }
     }

@@ -295,7 +295,7 @@ fn boot(flash: &Flash, signed: &[Signed], allowed: &mut Allowed, input: &mut Inp
     }
     // The newest that is confirmed for certain; what was confirmed in a failing power may not be.
     flash.0.borrow_mut().running = boot.running;
-    let mut floor = boot.floor;
+    let (mut floor, mut good) = (boot.floor, 0_u32);
     let mut robot = Robot::default();
     let (mut port, mut now_us, mut number) = (Port::new(), 0_u64, 1_u8);
     let mut frames = heapless::spsc::Queue::<_, 2>::new();
@@ -309,7 +309,8 @@ fn boot(flash: &Flash, signed: &[Signed], allowed: &mut Allowed, input: &mut Inp
                 let ask = ask(input, signed, updater.slots());
                 number =
                     if input.byte().is_multiple_of(4) { number } else { number.wrapping_add(1) };
-                note(&ask, &updater, allowed);
+                let may_confirm = good >= GOOD && robot.mode() != Mode::Running;
+                note(&ask, &updater, allowed, may_confirm);
                 line.0 = link::frame(&Message::Request(Request { number, ask }));
             }
             9 => line.0 = (0..input.byte()).map(|_| input.byte()).collect(),
@@ -322,9 +323,13 @@ fn boot(flash: &Flash, signed: &[Signed], allowed: &mut Allowed, input: &mut Inp
             12 => {
                 for _ in 0..input.byte() % 8 {
                     updater.ticked(Alarms::none());
+                    good += 1;
                 }
             }
-            13 => updater.ticked(Alarms::DIVERGED),
+            13 => {
+                updater.ticked(Alarms::DIVERGED);
+                good = 0;
+            }
             14 => {
                 let mut chip = flash.0.borrow_mut();
                 (chip.left, chip.torn) = (Some(u32::from(input.byte())), input.byte());
@@ -364,6 +369,7 @@ fn note<F: NorFlash, A: FnMut(Payload) -> bool>(
     ask: &Ask,
     updater: &Updater<'_, F, Owner, A>,
     allowed: &mut Allowed,
+    may_confirm: bool,
 ) {
     match ask {
         Ask::Activate { signature, .. } => {
@@ -376,6 +382,7 @@ fn note<F: NorFlash, A: FnMut(Payload) -> bool>(
         Ask::Confirm { signature } => {
             if let Some(release) = updater.slots().release()
                 && updater.slots().on_trial()
+                && may_confirm
                 && *signature == sign(Purpose::Confirm, &release)
             {
                 allowed.confirmed.insert(release.sequence);
