@@ -14,8 +14,8 @@ use firmware_core::blob::Aligned;
 use firmware_core::control_loop::rosbot::Motor;
 use firmware_core::control_loop::telemetry::Queue;
 use firmware_core::control_loop::{
-    ActuatorError, Actuators, Alarms, Command, ControlLoopError, Frame, Mode, Supervisor,
-    Telemetry, Timing, Tracker,
+    ActuatorError, Actuators, Alarms, Command, ControlLoop, ControlLoopError, Frame, Mode,
+    Supervisor, Telemetry, Timing, Tracker,
 };
 use firmware_core::device::{MonotonicClock, PositionSensor};
 use firmware_sim::mcu::position_sensor::MotionCaptureSettings;
@@ -75,14 +75,15 @@ impl<'m, 'a, 'q, A: Actuators<1>, S: PositionSensor<1>> CartLoop<'m, 'a, 'q, A, 
             held_back: 0,
         })
     }
+}
 
-    /// What the host asks for.
-    pub fn command(&mut self, command: Command<1>) {
+impl<A: Actuators<1>, S: PositionSensor<1>> ControlLoop<1> for CartLoop<'_, '_, '_, A, S> {
+    fn command(&mut self, command: Command<1>) {
         self.supervisor.follow(command, &mut self.wanted, &self.tracker);
     }
 
     /// One tick: sense, predict, act, report.
-    pub fn tick(&mut self, now_us: u64) -> Mode {
+    fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
         let measured = self.tracker.measure(&mut self.sensor);
         let is_running = self.supervisor.mode() == Mode::Running;
@@ -104,13 +105,24 @@ impl<'m, 'a, 'q, A: Actuators<1>, S: PositionSensor<1>> CartLoop<'m, 'a, 'q, A, 
         mode
     }
 
-    /// The end of a tick.
-    pub fn finish(&mut self, now_us: u64) -> Mode {
+    fn finish(&mut self, now_us: u64) -> Mode {
         let mode = self.supervisor.finish(now_us, &mut self.actuators);
         if mode != Mode::Running {
             self.applied = [0.0];
         }
         mode
+    }
+
+    fn path(&self) -> &[f32] {
+        self.tracker.path().as_flattened()
+    }
+
+    fn supervisor(&self) -> &Supervisor {
+        &self.supervisor
+    }
+
+    fn supervisor_mut(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
     }
 }
 
