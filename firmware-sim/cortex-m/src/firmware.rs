@@ -10,6 +10,7 @@ use embedded_io::{ErrorType as IoErrorType, Read, ReadReady, Write, WriteReady};
 use embedded_storage::nor_flash::{
     ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
+use firmware_core::Model;
 use firmware_core::blob::Aligned;
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
@@ -152,42 +153,59 @@ fn identity(
     Identity { firmware: "image", robot, factory, capacities, erase_ms: 4_000, good_ticks: 1_000 }
 }
 
-#[inline(never)]
-fn rosbot(trust: impl Trust) -> Option<()> {
-    let model = firmware_core::parse_for("skid-rosbot", &ROSBOT.0).ok()?;
-    let mut queue = Queue::<4>::new();
-    let (producer, mut frames) = queue.split();
-    let sides = Sides { right: Motor::new(Nowhere, Nowhere), left: Motor::new(Nowhere, Nowhere) };
-    let mut robot = Rosbot::<_, _, _, 10>::new(
-        &model,
-        (sides, (Nowhere, Nowhere), Nowhere),
-        RosbotSettings::default(),
-        Telemetry::new(producer),
-    )
-    .ok()?;
-    let capacities = Capacities::new::<3, 2>(100_000, 0);
-    serve(&mut robot, trust, identity("skid-rosbot", &ROSBOT.0, capacities), &mut frames)
+/// The model of the ROSbot.
+pub fn rosbot_model() -> Option<Model<'static>> {
+    firmware_core::parse_for("skid-rosbot", &ROSBOT.0).ok()
 }
 
-#[inline(never)]
-fn leg(trust: impl Trust) -> Option<()> {
-    let model = firmware_core::parse_for("soft-leg", &LEG.0).ok()?;
-    let mut queue = Queue::<4>::new();
-    let (producer, mut frames) = queue.split();
+/// Its loop.
+pub fn rosbot_loop<'m, 'q>(
+    model: &'m Model<'static>,
+    telemetry: Telemetry<'q>,
+) -> Option<impl ControlLoop<2> + use<'m, 'q>> {
+    let sides = Sides { right: Motor::new(Nowhere, Nowhere), left: Motor::new(Nowhere, Nowhere) };
+    let devices = (sides, (Nowhere, Nowhere), Nowhere);
+    // What the devices read stands still: no reason to stop.
+    let settings = RosbotSettings { stall_volt: 100.0, ..RosbotSettings::default() };
+    Rosbot::<_, _, _, 10>::new(model, devices, settings, telemetry).ok()
+}
+
+/// The model of the leg.
+pub fn leg_model() -> Option<Model<'static>> {
+    firmware_core::parse_for("soft-leg", &LEG.0).ok()
+}
+
+/// Its loop.
+pub fn leg_loop<'m, 'q>(
+    model: &'m Model<'static>,
+    telemetry: Telemetry<'q>,
+) -> Option<impl ControlLoop<2> + use<'m, 'q>> {
     let pneumatics = Pneumatics {
         bending: Chamber::new(Nowhere, Nowhere),
         extension: Chamber::new(Nowhere, Nowhere),
         input_pump: Nowhere,
         exhaust_pump: Nowhere,
     };
-    let mut leg = SoftLeg::<_, _, 20>::new(
-        &model,
-        pneumatics,
-        Nowhere,
-        SoftLegSettings::default(),
-        Telemetry::new(producer),
-    )
-    .ok()?;
+    let settings = SoftLegSettings::default();
+    SoftLeg::<_, _, 20>::new(model, pneumatics, Nowhere, settings, telemetry).ok()
+}
+
+#[inline(never)]
+fn rosbot(trust: impl Trust) -> Option<()> {
+    let model = rosbot_model()?;
+    let mut queue = Queue::<4>::new();
+    let (producer, mut frames) = queue.split();
+    let mut robot = rosbot_loop(&model, Telemetry::new(producer))?;
+    let capacities = Capacities::new::<3, 2>(100_000, 0);
+    serve(&mut robot, trust, identity("skid-rosbot", &ROSBOT.0, capacities), &mut frames)
+}
+
+#[inline(never)]
+fn leg(trust: impl Trust) -> Option<()> {
+    let model = leg_model()?;
+    let mut queue = Queue::<4>::new();
+    let (producer, mut frames) = queue.split();
+    let mut leg = leg_loop(&model, Telemetry::new(producer))?;
     let capacities = Capacities::new::<2, 2>(50_000, 0);
     serve(&mut leg, trust, identity("soft-leg", &LEG.0, capacities), &mut frames)
 }

@@ -88,8 +88,9 @@ pub struct Random {
     pub hold_s: [f64; 2],
 }
 
-/// How fast the controller is. Instructions of a model come from the core's cost table; the rest is an
-/// estimate until the loops are counted on the emulated controller.
+/// How fast the controller is. Instructions of a model come from the core's cost table; the rest is a round
+/// figure: counted on the emulated controller (firmware-sim/cortex-m/budgets.txt) it is less in most ticks, and
+/// more in one that is a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Controller {
