@@ -23,7 +23,7 @@ impl<S: Scalar> Sample<S> {
 /// The present sample and what a model looks at of the ones before it.
 ///
 /// It belongs to the models of one structure: to one that keeps other things it is empty.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct History<S> {
     registers: Registers<S>,
     /// Which [`Layout`] the registers have, and what it keeps.
@@ -35,6 +35,22 @@ pub struct History<S> {
 impl<S: Scalar> Default for History<S> {
     fn default() -> Self {
         Self { registers: Registers::new(), layout: 0, kept: (0, 0), filled: 0 }
+    }
+}
+
+/// Into a history that is there already only what is kept is copied, a fraction of the registers.
+impl<S: Scalar> Clone for History<S> {
+    fn clone(&self) -> Self {
+        Self { registers: self.registers.clone(), ..*self }
+    }
+
+    fn clone_from(&mut self, other: &Self) {
+        (self.layout, self.kept, self.filled) = (other.layout, other.kept, other.filled);
+        let (first, count) = other.kept;
+        let from = other.registers.slice(first, count.into());
+        for (to, x) in self.registers.slice_mut(first, count.into()).iter_mut().zip(from) {
+            *to = *x;
+        }
     }
 }
 

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use firmware_core::blob::{self, Aligned, ParseError};
 use firmware_core::cost::Cost;
-use firmware_core::{Predictor, PredictorState, parse, parse_for};
+use firmware_core::{Model, Predictor, PredictorState, parse, parse_for};
+use firmware_sim::run::Blob as SimBlob;
 use trainer::edmd;
 use trainer::export::{coordinate, export};
 use trainer::recording::{Recording, Visitor};
@@ -222,5 +223,44 @@ fn a_rollout_over_the_whole_first_log_stays_finite() {
         let rolled_out = predictor.rollout(&mut state, &inputs, &mut predicted);
         assert_eq!(rolled_out, Ok(()), "{}", folder.display());
         assert!(predicted.iter().all(|x| x.is_finite()), "{}", folder.display());
+    }
+}
+
+/// Whatever a state was used for, what is cloned into it predicts as the original does, to the bit.
+#[test]
+fn a_state_cloned_into_another_one_predicts_the_same() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models");
+    let blobs = ["rosbot", "skid-rosbot", "soft-leg", "two-link-arm"]
+        .map(|name| SimBlob::read(&folder.join(name).join("model.bin")).unwrap());
+    let models = blobs.each_ref().map(|blob| blob.model().unwrap());
+    let seen = |model: &Model<'_>, value: f32| {
+        let (n, m) = (model.structure().states().len(), model.structure().inputs().len());
+        let mut state = PredictorState::new();
+        for k in 0..=model.structure().lag() {
+            let x: Vec<f32> = (0..n).map(|i| value * (1.0 + 0.1 * (i + k) as f32)).collect();
+            Predictor::new(model).observe(&mut state, &vec![0.5; m], &x).unwrap();
+        }
+        state
+    };
+    let rollout = |model: &Model<'_>, mut state: PredictorState| {
+        let (n, m) = (model.structure().states().len(), model.structure().inputs().len());
+        let mut path = vec![0.0; 5 * n];
+        Predictor::new(model).rollout_held(&mut state, &vec![0.25; m], &mut path).unwrap();
+        path.iter().map(|x| x.to_bits()).collect::<Vec<_>>()
+    };
+    for model in &models {
+        let original = seen(model, 0.1);
+        let expected = rollout(model, original.clone());
+        let others = models.iter().map(|other| seen(other, 0.3)).chain([PredictorState::new()]);
+        for mut used in others {
+            used.clone_from(&original);
+            assert_eq!(used, original);
+            assert_eq!(rollout(model, used), expected, "{}", model.structure().robot());
+        }
+        // An empty one empties it.
+        let mut used = seen(model, 0.2);
+        used.clone_from(&PredictorState::new());
+        assert_eq!(used, PredictorState::new());
+        assert!(used.history().is_empty());
     }
 }

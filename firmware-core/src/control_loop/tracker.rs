@@ -68,6 +68,8 @@ pub struct Tracked<const N: usize> {
 pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
     predictor: Predictor<'m, 'a>,
     state: PredictorState,
+    /// Where the next samples are predicted; nothing in it is kept.
+    trial: PredictorState,
     monitor: Monitor,
     /// A prediction without corrections, its monitor, and its length.
     shadow: PredictorState,
@@ -112,6 +114,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         Ok(Self {
             predictor: Predictor::new(model),
             state: PredictorState::new(),
+            trial: PredictorState::new(),
             monitor,
             shadow: PredictorState::new(),
             slow: monitor,
@@ -174,15 +177,15 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         held: &[f32; M],
     ) -> Tracked<N> {
         let mut alarms = Alarms::none();
-        let mut ahead = self.state.clone();
+        self.trial.clone_from(&self.state);
         let mut predicted = None;
-        match self.predictor.step(&mut ahead, applied) {
-            Ok(()) => predicted = Some(self.coordinates(&ahead)),
+        match self.predictor.step(&mut self.trial, applied) {
+            Ok(()) => predicted = Some(self.coordinates(&self.trial)),
             Err(PredictError::NotReady { .. }) => {}
             // Inputs are finite and of the right number: what is left is divergence.
             Err(_) => alarms |= Alarms::DIVERGED,
         }
-        if ahead.out_of_range().is_some() {
+        if self.trial.out_of_range().is_some() {
             alarms |= Alarms::OUT_OF_RANGE;
         }
         self.unpredicted = match predicted {
@@ -192,7 +195,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         if self.unpredicted > self.unpredicted_limit {
             alarms |= Alarms::SENSOR_LOST;
         }
-        let steps = predicted.map_or(0, |_| ahead.step());
+        let steps = predicted.map_or(0, |_| self.trial.step());
         let guesses = (self.guessed & self.looks_at).count_ones();
         let bound_steps = if predicted.is_some() { steps.max(1 + guesses) } else { 0 };
 
@@ -251,22 +254,25 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
                     alarms |= Alarms::SENSOR_LOST;
                 }
                 // A gap in a history that was not full, or no prediction: begin anew.
-                self.state = if predicted.is_some() { ahead } else { PredictorState::new() };
+                match predicted {
+                    Some(_) => self.state.clone_from(&self.trial),
+                    None => self.state = PredictorState::new(),
+                }
             }
         }
 
         if self.shadow.step() >= self.shadow_steps || self.shadow.history().is_empty() {
             // It starts from measurements alone: what it is compared with are the bounds of those.
-            self.shadow = match self.guessed & self.looks_at {
-                0 => self.state.clone(),
-                _ => PredictorState::new(),
-            };
+            match self.guessed & self.looks_at {
+                0 => self.shadow.clone_from(&self.state),
+                _ => self.shadow = PredictorState::new(),
+            }
         }
 
-        let (predictor, mut future) = (self.predictor, self.state.clone());
+        self.trial.clone_from(&self.state);
         self.ahead = 0;
         for place in &mut self.path {
-            match predictor.step(&mut future, held) {
+            match self.predictor.step(&mut self.trial, held) {
                 Ok(()) => {}
                 Err(PredictError::NotReady { .. }) => break,
                 Err(_) => {
@@ -274,7 +280,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
                     break;
                 }
             }
-            let _ = predictor.coordinates(&future, place);
+            let _ = self.predictor.coordinates(&self.trial, place);
             self.ahead += 1;
         }
         let ratio = verdict.ratio;
