@@ -13,10 +13,8 @@
 
 use core::hint::black_box;
 
-use cortex_m::peripheral::SYST;
-use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m_rt::entry;
-use cortex_m_semihosting::{debug, hprintln};
+use cortex_m_semihosting::hprintln;
 use firmware_core::blob::{Aligned, parse, self_test};
 use firmware_core::link::{MAX_FRAME, Message, Received, Receiver, encode};
 use firmware_core::slots::sha256;
@@ -24,11 +22,14 @@ use firmware_core::update::{Ask, MAX_CHUNK, PublicKey, Request, Trust};
 use firmware_core::{Model, Predictor, PredictorState};
 
 mod host;
+mod machine;
+mod models;
+
+use machine::count;
+use models::MODELS;
 
 /// Repetitions that are counted together: a tick is then less than a hundredth of an instruction.
 const REPETITIONS: u32 = 1_000;
-/// Rounds of the loop that calibrates, of two instructions each.
-const CALIBRATION: u32 = 1_000_000;
 /// A public key, and the signature of 64 zeros by its owner, whose seed is 32 times 1.
 const KEY: [u8; 32] = [
     138, 136, 227, 221, 116, 9, 241, 149, 253, 82, 219, 45, 60, 186, 93, 114, 202, 103, 9, 191, 29,
@@ -43,40 +44,13 @@ const SIGNED: [u8; 64] = [
 /// Room for the largest blob that is read from the host.
 const ROOM: usize = 48 * 1024;
 
-static MODELS: [&Aligned<[u8]>; 4] = [
-    &Aligned(*include_bytes!("../../../models/rosbot/model.bin")),
-    &Aligned(*include_bytes!("../../../models/skid-rosbot/model.bin")),
-    &Aligned(*include_bytes!("../../../models/soft-leg/model.bin")),
-    &Aligned(*include_bytes!("../../../models/two-link-arm/model.bin")),
-];
-
 #[entry]
 fn main() -> ! {
-    let ok = measure().is_some();
-    debug::exit(if ok { debug::EXIT_SUCCESS } else { debug::EXIT_FAILURE });
-    loop {
-        cortex_m::asm::wfi();
-    }
-}
-
-#[panic_handler]
-fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
-    hprintln!("panic");
-    debug::exit(debug::EXIT_FAILURE);
-    loop {
-        cortex_m::asm::wfi();
-    }
+    machine::end(measure().is_some())
 }
 
 fn measure() -> Option<()> {
-    let mut timer = cortex_m::Peripherals::take()?.SYST;
-    timer.set_clock_source(SystClkSource::Core);
-    timer.set_reload(0x00FF_FFFF);
-    timer.clear_current();
-    timer.enable_counter();
-    // `delay(n)` runs a loop of two instructions n + 1 times.
-    let ticks = count(|| cortex_m::asm::delay(CALIBRATION - 1));
-    let per_tick = 2.0 * CALIBRATION as f32 / ticks as f32;
+    let per_tick = machine::instructions_per_tick()?;
     hprintln!(
         "# model {} B, state {} B, {} instructions per tick",
         size_of::<Model<'_>>(),
@@ -137,13 +111,6 @@ fn update(per_tick: f32) -> Option<()> {
         per_byte(line, length)
     );
     (good && received == 1).then_some(())
-}
-
-/// Ticks that `work` takes; the timer counts down.
-fn count(work: impl FnOnce()) -> u32 {
-    let before = SYST::get_current();
-    work();
-    before.wrapping_sub(SYST::get_current()) & 0x00FF_FFFF
 }
 
 /// Measures a step from the samples of the blob's self-test.

@@ -5,8 +5,8 @@
 #![no_main]
 
 use cortex_m_rt::entry;
-use cortex_m_semihosting::{debug, hprintln};
-use firmware_core::blob::{Aligned, parse};
+use cortex_m_semihosting::hprintln;
+use firmware_core::blob::parse;
 
 #[path = "../bits.rs"]
 mod bits;
@@ -14,30 +14,18 @@ mod bits;
 #[allow(dead_code)]
 #[path = "../host.rs"]
 mod host;
+// Nor is the counter.
+#[allow(dead_code)]
+#[path = "../machine.rs"]
+mod machine;
+#[path = "../models.rs"]
+mod models;
 
-static MODELS: [&Aligned<[u8]>; 4] = [
-    &Aligned(*include_bytes!("../../../../models/rosbot/model.bin")),
-    &Aligned(*include_bytes!("../../../../models/skid-rosbot/model.bin")),
-    &Aligned(*include_bytes!("../../../../models/soft-leg/model.bin")),
-    &Aligned(*include_bytes!("../../../../models/two-link-arm/model.bin")),
-];
-
-#[panic_handler]
-fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
-    hprintln!("panic");
-    debug::exit(debug::EXIT_FAILURE);
-    loop {
-        cortex_m::asm::wfi();
-    }
-}
+use models::MODELS;
 
 #[entry]
 fn main() -> ! {
-    let ok = predict().is_some();
-    debug::exit(if ok { debug::EXIT_SUCCESS } else { debug::EXIT_FAILURE });
-    loop {
-        cortex_m::asm::wfi();
-    }
+    machine::end(predict().is_some())
 }
 
 fn predict() -> Option<()> {

@@ -8,10 +8,8 @@
 
 use core::hint::black_box;
 
-use cortex_m::peripheral::SYST;
-use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m_rt::entry;
-use cortex_m_semihosting::{debug, hprintln};
+use cortex_m_semihosting::hprintln;
 use firmware_core::control_loop::telemetry::{Frames, Queue};
 use firmware_core::control_loop::{Command, ControlLoop, Mode, Telemetry};
 
@@ -19,38 +17,21 @@ use firmware_core::control_loop::{Command, ControlLoop, Mode, Telemetry};
 #[allow(dead_code)]
 #[path = "../firmware.rs"]
 mod firmware;
+#[path = "../machine.rs"]
+mod machine;
 
-/// Rounds of the loop that calibrates, of two instructions each.
-const CALIBRATION: u32 = 1_000_000;
+use machine::count;
+
 /// Ticks of a loop that are counted.
 const TICKS: u64 = 2_000;
 
-#[panic_handler]
-fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
-    hprintln!("panic");
-    debug::exit(debug::EXIT_FAILURE);
-    loop {
-        cortex_m::asm::wfi();
-    }
-}
-
 #[entry]
 fn main() -> ! {
-    let ok = measure().is_some();
-    debug::exit(if ok { debug::EXIT_SUCCESS } else { debug::EXIT_FAILURE });
-    loop {
-        cortex_m::asm::wfi();
-    }
+    machine::end(measure().is_some())
 }
 
 fn measure() -> Option<()> {
-    let mut timer = cortex_m::Peripherals::take()?.SYST;
-    timer.set_clock_source(SystClkSource::Core);
-    timer.set_reload(0x00FF_FFFF);
-    timer.clear_current();
-    timer.enable_counter();
-    let ticks = count(|| cortex_m::asm::delay(CALIBRATION - 1));
-    let per_tick = 2.0 * CALIBRATION as f32 / ticks as f32;
+    let per_tick = machine::instructions_per_tick()?;
     let rosbot = firmware::rosbot_model()?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
@@ -61,13 +42,6 @@ fn measure() -> Option<()> {
     let (producer, mut frames) = queue.split();
     let mut robot = firmware::leg_loop(&leg, Telemetry::new(producer))?;
     one("soft-leg", &mut robot, &mut frames, (50_000, 1), per_tick)
-}
-
-/// Ticks of the timer that `work` takes; it counts down.
-fn count(work: impl FnOnce()) -> u32 {
-    let before = SYST::get_current();
-    work();
-    before.wrapping_sub(SYST::get_current()) & 0x00FF_FFFF
 }
 
 /// Runs a loop; every `per_sample`th of its ticks, `period_us` apart, is a sample.
