@@ -134,6 +134,13 @@ pub struct Geometry {
     pub slot_bytes: u32,
 }
 
+impl Geometry {
+    /// Bytes of a payload there is room for in a slot.
+    pub const fn room(self) -> u32 {
+        self.slot_bytes.saturating_sub(PAYLOAD_OFFSET)
+    }
+}
+
 /// Why there cannot be slots like this.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -695,8 +702,7 @@ impl<F: NorFlash> Slots<F> {
                 _ => Refusal::Rejected,
             })?;
         }
-        let offset = self.at(side, PAYLOAD_OFFSET);
-        let payload = Payload { slot: side.into(), offset, length, sequence };
+        let payload = self.payload(side, &record.header);
         if !accept(payload) {
             return Err(Refusal::NotAccepted);
         }
@@ -732,7 +738,7 @@ impl<F: NorFlash> Slots<F> {
 
     /// Bytes there is room for in a slot.
     pub fn room(&self) -> u32 {
-        self.geometry.slot_bytes.saturating_sub(PAYLOAD_OFFSET)
+        self.geometry.room()
     }
 
     /// Bytes of the payload that have been accepted, or `None` if no update is under way, or not that far:
@@ -817,7 +823,7 @@ impl<F: NorFlash> Slots<F> {
             return Ok(0);
         };
         let update = self.update.take();
-        let sector = u32::try_from(F::ERASE_SIZE).unwrap_or(u32::MAX);
+        let sector = Self::sector();
         let (to, end) = (from.saturating_add(sector), self.at(side, self.geometry.slot_bytes));
         self.flash.erase(from, to)?;
         let stage = if to < end { Stage::Erasing(to) } else { Stage::Writing };
@@ -827,8 +833,7 @@ impl<F: NorFlash> Slots<F> {
 
     /// Sectors of a slot.
     pub fn sectors(&self) -> u32 {
-        let sector = u32::try_from(F::ERASE_SIZE).unwrap_or(u32::MAX);
-        self.geometry.slot_bytes.checked_div(sector).unwrap_or(0)
+        self.geometry.slot_bytes.checked_div(Self::sector()).unwrap_or(0)
     }
 
     /// Writes the next part of the payload, of any length. What does not fill a write unit waits for
@@ -892,12 +897,7 @@ impl<F: NorFlash> Slots<F> {
     pub fn verify(&mut self) -> Result<Payload, VerifyError<F::Error>> {
         let mut update = self.update.ok_or(VerifyError::NotWriting)?;
         let Update { side, written, header, .. } = update;
-        let payload = Payload {
-            slot: side.into(),
-            offset: self.at(side, PAYLOAD_OFFSET),
-            length: header.length,
-            sequence: header.sequence,
-        };
+        let payload = self.payload(side, &header);
         match update.stage {
             Stage::Writing => {}
             Stage::Verified => return Ok(payload),
@@ -968,6 +968,17 @@ impl<F: NorFlash> Slots<F> {
         self.trial = false;
         self.floor = self.floor.max(running.header.sequence);
         Ok(())
+    }
+
+    /// Where the payload of a slot with this header lies.
+    fn payload(&self, side: Side, header: &Header) -> Payload {
+        let Header { length, sequence, .. } = *header;
+        Payload { slot: side.into(), offset: self.at(side, PAYLOAD_OFFSET), length, sequence }
+    }
+
+    /// Bytes of a sector.
+    fn sector() -> u32 {
+        u32::try_from(F::ERASE_SIZE).unwrap_or(u32::MAX)
     }
 
     /// Where a byte of a slot lies in the flash.

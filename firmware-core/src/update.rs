@@ -742,10 +742,11 @@ where
         mut accept: A,
     ) -> Result<(Self, Boot<F::Error>), GeometryError> {
         let (slots, boot) = Slots::boot(flash, geometry, identity.robot, lowest, &mut accept)?;
-        let Identity { robot: name, factory, .. } = identity;
-        let (length, sha256) = (count(factory.len()), sha256(factory));
-        let factory = Release { length, sha256, sequence: 0, robot: robot(name) };
-        let release = slots.release().unwrap_or(factory);
+        let release = slots.release().unwrap_or_else(|| {
+            let Identity { robot: name, factory, .. } = identity;
+            let (length, sha256) = (count(factory.len()), sha256(factory));
+            Release { length, sha256, sequence: 0, robot: robot(name) }
+        });
         let (session, job, pause_until_us) = (None, None, 0);
         let (wrong_signature, worked, good, resets) = (false, false, 0, false);
         let updater = Self {

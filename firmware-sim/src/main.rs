@@ -263,7 +263,7 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
     let structure = model.structure();
     let scenario = scenario((args.scenario.as_deref(), args.seconds, &args.faults), structure)?;
     // Not only after a run of a minute.
-    if let Some(path) = args.plot.as_ref().filter(|path| !folder_of(path).is_dir()) {
+    if let Some(path) = args.plot.as_ref().filter(|path| !run::folder_of(path).is_dir()) {
         return Err(
             format!("{}: cannot be written: there is no such folder", path.display()).into()
         );
@@ -313,7 +313,8 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
         writeln!(std::io::stderr(), "{} logs in {}", logger.episodes(), dir.display())?;
     }
     if let (Some(figure), Some(path)) = (&figure, &args.plot) {
-        write_whole(path, figure.svg()?.as_bytes())?;
+        let written = run::write_whole(path, figure.svg()?.as_bytes());
+        written.map_err(|e| format!("{}: cannot be written: {e}", path.display()))?;
     }
     print_summary(args, &summary)?;
     if summary.holds() {
@@ -321,20 +322,6 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
     } else {
         Err("a fault was missed, or an actuator was driven out of turn: see the table".into())
     }
-}
-
-fn folder_of(file: &Path) -> &Path {
-    file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
-/// Writes a file whole or not at all.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Box<dyn Error>> {
-    let folder = folder_of(path);
-    let failed = |e: &dyn std::fmt::Display| format!("{}: cannot be written: {e}", path.display());
-    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(|e| failed(&e))?;
-    file.write_all(bytes).map_err(|e| failed(&e))?;
-    file.persist(path).map_err(|e| failed(&e))?;
-    Ok(())
 }
 
 fn sweep_model(args: &SweepArgs) -> Result<(), Box<dyn Error>> {

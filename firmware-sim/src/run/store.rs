@@ -2,10 +2,10 @@
 
 use crate::mcu::flash::{Flash, Region};
 use crate::mcu::{Board, VirtualClock};
-use crate::run::Blob;
 use crate::run::scenario::Controller;
+use crate::run::{Blob, write_whole};
 use embedded_storage::nor_flash::ReadNorFlash;
-use firmware_core::slots::{Boot, Geometry, PAYLOAD_OFFSET, Payload, Which};
+use firmware_core::slots::{Boot, Geometry, Payload, Which};
 use firmware_core::update::{Capacities, Identity, PublicKey, Trust, Updater};
 use std::cell::Cell;
 use std::path::PathBuf;
@@ -118,13 +118,7 @@ impl Store {
     pub(crate) fn save(&mut self, installed: &Installed) -> std::io::Result<()> {
         self.image = installed.flash.snapshot();
         self.signatures = installed.checked.get();
-        let Some(file) = &self.file else { return Ok(()) };
-        let folder = file.parent().filter(|p| !p.as_os_str().is_empty());
-        let folder = folder.unwrap_or(std::path::Path::new("."));
-        let mut whole = tempfile::NamedTempFile::new_in(folder)?;
-        std::io::Write::write_all(&mut whole, &self.image)?;
-        whole.persist(file)?;
-        Ok(())
+        self.file.as_ref().map_or(Ok(()), |file| write_whole(file, &self.image))
     }
 
     /// Takes note of a boot.
@@ -236,8 +230,7 @@ impl Installed {
             good_ticks: (GOOD_S * 1e6 / *tick_us as f64) as u32,
         };
         let geometry = Geometry { offset: 0, slot_bytes: SECTOR as u32 };
-        let room = geometry.slot_bytes - PAYLOAD_OFFSET;
-        let capacities = Capacities { room, ..capacities };
+        let capacities = Capacities { room: geometry.room(), ..capacities };
         let region = || self.flash.region(0..2).expect("these are its sectors");
         let trust = self.key.map(|key| Timed {
             key,
