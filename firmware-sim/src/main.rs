@@ -464,11 +464,10 @@ fn serve_model(args: &ServeArgs) -> Result<(), Box<dyn Error>> {
 }
 
 fn plant(args: &PlantArgs) -> Result<(), Box<dyn Error>> {
-    let robot = match args.robot {
-        PlantRobot::Rosbot => plant_line::Robot::Rosbot,
-        PlantRobot::SoftLeg => plant_line::Robot::SoftLeg,
+    let (robot, called) = match args.robot {
+        PlantRobot::Rosbot => (plant_line::Robot::Rosbot, "rosbot"),
+        PlantRobot::SoftLeg => (plant_line::Robot::SoftLeg, "soft-leg"),
     };
-    // Without a script of its own the host has nothing that could end.
     let scenario = scenario((args.scenario.as_deref(), Some(NO_END_S), &args.faults), robot.run())?;
     let faults: Vec<Fault> = scenario.faults.iter().map(|fault| fault.0).collect();
     let mut plant = Plant::new(robot, &faults, args.seed)?;
@@ -479,7 +478,7 @@ fn plant(args: &PlantArgs) -> Result<(), Box<dyn Error>> {
     if let Some(link) = &args.link {
         let door = args.door.open()?;
         let mut out = std::io::stdout();
-        writeln!(out, "{robot:?} on {}", door.name()?)?;
+        writeln!(out, "{called} on {}", door.name()?)?;
         out.flush()?;
         let (name, link, seed, drives) = (link.clone(), open(link)?, args.seed, args.drive);
         std::thread::spawn(move || {

@@ -193,9 +193,15 @@ pub struct Receiver {
     length: usize,
 }
 
+impl Default for Receiver {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl Receiver {
     /// Nothing received.
-    pub const fn new() -> Self {
+    pub fn new() -> Self {
         Self { frame: [0; MAX_FRAME], length: 0 }
     }
 
@@ -242,12 +248,12 @@ mod tests {
         // Zeros: the two upper bytes of the tick, and both of the left duty.
         let body = [4, 1, 2, 1, 1, 3, 0x3A, 0x12, 1, 6, 2];
         assert_eq!(frame[..body.len()], body);
-        assert_eq!(received(&frame[..length]), [ACTUATORS]);
+        assert_eq!(received::<Actuators>(&frame[..length]), [ACTUATORS]);
         assert_eq!(received::<Sensors>(&frame[..length]), []);
         for sensors in [SENSORS, Sensors { position: None, ..SENSORS }] {
             let (frame, length) = sensors.frame();
             assert_eq!((frame[length - 1], length), (0, MAX_FRAME));
-            assert_eq!(received(&frame[..length]), [sensors]);
+            assert_eq!(received::<Sensors>(&frame[..length]), [sensors]);
         }
     }
 
@@ -261,7 +267,11 @@ mod tests {
                 bytes[i] ^= 1 << bit;
                 bytes.push(0);
                 bytes.extend_from_slice(&next[..next_length]);
-                assert_eq!(received(&bytes), [Sensors { tick: 7, ..SENSORS }], "{i} {bit}");
+                assert_eq!(
+                    received::<Sensors>(&bytes),
+                    [Sensors { tick: 7, ..SENSORS }],
+                    "{i} {bit}"
+                );
             }
         }
         let endless = [&[1; 1000], &[0][..], &next[..next_length]].concat();

@@ -1,13 +1,13 @@
 //! A robot whose controller is somewhere else: in QEMU (firmware-sim/cortex-m/robot), or on a board.
 //!
 //! ```text
-//!  controller ══ line ([`plant_line`]) ══ plant       sensors and actuators, a frame each way per tick
-//!      └──────── link (docs/protocol.md) ─────────┐   commands and telemetry, as they are
-//!  client ─────────── door ──────────────────── [`pass_on`], which drives, if asked to
+//!  controller ══ line ═════════════════════ Plant     sensors and actuators, a frame each way per tick
+//!      ╚════════ link ══ pass_on ══ door ══ client    commands and telemetry, docs/protocol.md
 //! ```
 //!
-//! The robot's time is that of its controller: it moves for a tick when it hears of one. What the controller
-//! does between two ticks it does not see: outputs are what they were at the end of a tick.
+//! What goes over the line is specified in [`plant_line`](crate::plant_line). The robot's time is that of its
+//! controller: it moves for a tick when it hears of one, under the outputs that the controller had set at the
+//! tick's end. What it sets and takes back within a tick the robot does not see.
 
 use crate::bench::{RosbotBench, SoftLegBench};
 use crate::fault::{Fault, FaultKind, Faults};
@@ -443,5 +443,96 @@ pub fn pass_on(
         if let Some(error) = remote.end().error.take() {
             return Err(error);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const AHEAD: Actuators =
+        Actuators { robot: Robot::Rosbot, tick: 0, duties: [2333; 2], pins: 0 };
+
+    fn plant(faults: &[&str]) -> Result<Plant, RunError> {
+        let faults: Vec<Fault> = faults.iter().map(|fault| fault.parse().unwrap()).collect();
+        Plant::new(Robot::Rosbot, &faults, 1)
+    }
+
+    fn ticks(plant: &mut Plant, ticks: impl IntoIterator<Item = u32>) -> Sensors {
+        let ticked = ticks.into_iter().map(|tick| plant.tick(&Actuators { tick, ..AHEAD }));
+        ticked.last().unwrap().unwrap()
+    }
+
+    #[test]
+    fn a_robot_that_missed_frames_is_where_it_would_have_been() {
+        let mut whole = plant(&[]).unwrap();
+        let mut missing = plant(&[]).unwrap();
+        let expected = ticks(&mut whole, 0..100);
+        let found = ticks(&mut missing, (0..100).filter(|tick| tick % 7 != 3));
+        assert_eq!(found.counts, expected.counts);
+        assert!(expected.counts[0] > 2000);
+    }
+
+    #[test]
+    fn a_controller_that_was_reset_finds_the_robot_where_it_left_it() {
+        let mut plant = plant(&[]).unwrap();
+        let before = ticks(&mut plant, 0..100).counts[0];
+        let off = Actuators { duties: [0; 2], ..AHEAD };
+        let after = plant.tick(&off).unwrap();
+        assert_eq!(after.tick, 0);
+        assert!((1..50).contains(&after.counts[0].wrapping_sub(before)), "{before} {after:?}");
+    }
+
+    #[test]
+    fn pins_turn_motors_round_without_load() {
+        let mut plant = plant(&[]).unwrap();
+        ticks(&mut plant, 0..100);
+        let (backwards, tick) = (Actuators { pins: 1, ..AHEAD }, 100..300);
+        let turned = tick.map(|tick| plant.tick(&Actuators { tick, ..backwards }).unwrap());
+        let [right, left] = turned.last().unwrap().counts;
+        assert!((right as i16) < 0 && left as i16 > 5000, "{right} {left}");
+    }
+
+    #[test]
+    fn faults_are_those_of_the_robot() {
+        let mut lost = plant(&["dropout@0..10=1"]).unwrap();
+        assert_eq!(ticks(&mut lost, 0..10).position, None);
+        assert!(ticks(&mut plant(&[]).unwrap(), 0..10).position.is_some());
+        for fault in ["leak@0..1=1", "late-tick@0..1=1", "silence@0..1=1", "brown-out@0..1=1"] {
+            assert!(matches!(plant(&[fault]), Err(RunError::Fault { .. })), "{fault}");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_line_is_served_until_it_ends() {
+        let (mut ours, theirs) = UnixStream::pair().unwrap();
+        let controller = std::thread::spawn(move || {
+            let (mut receiver, mut heard, mut bytes) = (Receiver::new(), Vec::new(), [0; 64]);
+            let others = Actuators { robot: Robot::SoftLeg, ..AHEAD };
+            // Noise and what is another robot's get no answer.
+            ours.write_all(&[7, 7, 0]).unwrap();
+            for actuators in [others, AHEAD, Actuators { tick: 5, ..AHEAD }, AHEAD] {
+                let (frame, length) = actuators.frame();
+                ours.write_all(&frame[..length]).unwrap();
+            }
+            while heard.len() < 3 {
+                let count = ours.read(&mut bytes).unwrap();
+                let bodies = bytes[..count].iter().filter_map(|byte| receiver.push(*byte));
+                heard.extend(bodies.map(|sensors: Sensors| sensors.tick));
+            }
+            heard
+        });
+        let (mut line, mut said) = (Line::Unix(theirs), Vec::new());
+        let mut plant = plant(&[]).unwrap();
+        let Err(error) = plant.serve(&mut line, &mut |what| said.push(what.to_owned()));
+        assert_eq!(error.kind(), ErrorKind::UnexpectedEof);
+        assert_eq!(controller.join().unwrap(), [0, 5, 0]);
+        let expected = [
+            "the controller's robot is another one",
+            "the controller is there",
+            "the controller was reset",
+        ];
+        assert_eq!(said, expected);
     }
 }

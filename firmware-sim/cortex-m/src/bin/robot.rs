@@ -81,7 +81,7 @@ struct Of {
 #[entry]
 fn main() -> ! {
     if start().is_none() {
-        hprintln!("there is no firmware like this");
+        hprintln!("expected `rosbot` or `soft-leg`, and a file that holds a public key, if any");
     }
     machine::end(false)
 }
@@ -126,7 +126,7 @@ fn rosbot(controller: Controller) -> Option<()> {
     let capacities = Capacities::new::<3, 2>(100_000, instructions(10_000, 12));
     let of = Of { name: "skid-rosbot", factory: &ROSBOT.0, capacities, period_us: 10_000 };
     let Controller { clock, link, line, key } = controller;
-    let (mut updater, blob) = boot(&of, key)?;
+    let Booted { mut updater, blob } = boot(&of, key)?;
     let model = firmware_core::parse_for(of.name, blob).ok()?;
     let plant = Plant::new(plant_line::Robot::Rosbot, line);
     let sides = Sides {
@@ -146,7 +146,7 @@ fn leg(controller: Controller) -> Option<()> {
     let capacities = Capacities::new::<2, 2>(50_000, instructions(50_000, 22));
     let of = Of { name: "soft-leg", factory: &LEG.0, capacities, period_us: 50_000 };
     let Controller { clock, link, line, key } = controller;
-    let (mut updater, blob) = boot(&of, key)?;
+    let Booted { mut updater, blob } = boot(&of, key)?;
     let model = firmware_core::parse_for(of.name, blob).ok()?;
     let plant = Plant::new(plant_line::Robot::SoftLeg, line);
     let pneumatics = Pneumatics {
@@ -163,14 +163,14 @@ fn leg(controller: Controller) -> Option<()> {
     run(&of, &mut robot, &mut updater, &mut frames, &plant, (clock, link))
 }
 
-/// Its end of updates, and the model that it chose.
-fn boot(
-    of: &Of,
-    key: Option<PublicKey>,
-) -> Option<(
-    Updater<'static, SlotsInRam, Option<PublicKey>, impl FnMut(Payload) -> bool + use<>>,
-    &'static [u8],
-)> {
+/// What a boot decided.
+struct Booted<A> {
+    updater: Updater<'static, SlotsInRam, Option<PublicKey>, A>,
+    /// The model that runs.
+    blob: &'static [u8],
+}
+
+fn boot(of: &Of, key: Option<PublicKey>) -> Option<Booted<impl FnMut(Payload) -> bool + use<>>> {
     let Of { name: robot, factory, capacities, period_us } = *of;
     let identity = Identity {
         firmware: concat!("image ", env!("CARGO_PKG_VERSION")),
@@ -209,7 +209,7 @@ fn boot(
         Some(payload) => unsafe { SlotsInRam::map(payload) }?,
         None => factory,
     };
-    Some((updater, blob))
+    Some(Booted { updater, blob })
 }
 
 /// Tick after tick, until a reset.
