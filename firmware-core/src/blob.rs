@@ -22,7 +22,7 @@
 //!
 //! | kind | section | encoding | status |
 //! |---|---|---|---|
-//! | 0x0001 | metadata: [`ModelRepr`] | 1: postcard 1 | required |
+//! | 0x0001 | metadata: [`ModelRepr`](crate::ModelRepr) | 1: postcard 1 | required |
 //! | 0x0002 | coefficients `[outputs, dense_terms]`, of a sparse model `[outputs, T + 1]` | 2: f32, powers of the observables | required |
 //! | 0x0003 | self-test, below | 3: f32 | required |
 //! | 0x0004 | terms of a sparse model, below: `[T, 2]` | 4: u8 | makes the model sparse |
@@ -59,13 +59,12 @@
 //! enumerations as a varint of the variant in the order of the declaration, `f32` as four bytes,
 //! text and lists with their length first.
 
-use crc::{CRC_32_ISO_HDLC, Crc};
-use serde::Deserialize;
-
 use crate::Scalar;
 use crate::capacity::MAX_STATES;
+use crate::dictionary::DictionaryError;
+use crate::encoding::ReadError;
 use crate::error_bounds::{ErrorBounds, ErrorBoundsError};
-use crate::model::{Model, ModelError, ModelRepr, Structure};
+use crate::model::{Model, ModelError, Structure};
 use crate::predictor::{PredictError, Predictor, PredictorState};
 use crate::sparse::SparseTerms;
 
@@ -87,7 +86,39 @@ const TERMS: (u16, u16) = (0x0004, 4);
 const RANGES: (u16, u16) = (0x8001, 3);
 const ERROR_BOUNDS: (u16, u16) = (0x8002, 5);
 
-pub(crate) const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+/// What a byte does to the CRC-32 (ISO-HDLC: polynomial 0x04C11DB7, reflected).
+const BYTES: [u32; 256] = {
+    let mut bytes = [0; 256];
+    let mut rest: &mut [u32] = &mut bytes;
+    let mut byte = 0;
+    while let Some((first, others)) = rest.split_first_mut() {
+        let (mut crc, mut bit) = (byte, 0);
+        while bit < 8 {
+            crc = (crc >> 1) ^ if crc & 1 == 1 { 0xEDB8_8320 } else { 0 };
+            bit += 1;
+        }
+        *first = crc;
+        byte += 1;
+        rest = others;
+    }
+    bytes
+};
+
+/// CRC-32 (ISO-HDLC) of bytes that follow others with the checksum `before`; that of nothing is 0.
+///
+/// A word at a time: four instructions a byte on a Cortex-M, a quarter of them to fetch the bytes.
+pub(crate) fn crc32(before: u32, bytes: &[u8]) -> u32 {
+    let next = |crc: u32| {
+        let [index, ..] = crc.to_le_bytes();
+        // Never out of bounds: there are as many as bytes.
+        (crc >> 8) ^ BYTES.get(usize::from(index)).copied().unwrap_or(0)
+    };
+    let (words, rest) = bytes.as_chunks::<4>();
+    let whole = words
+        .iter()
+        .fold(!before, |crc, word| next(next(next(next(crc ^ u32::from_le_bytes(*word))))));
+    !rest.iter().fold(whole, |crc, byte| next(crc ^ u32::from(*byte)))
+}
 
 /// Puts bytes at an address divisible by four, as a blob needs them.
 ///
@@ -175,9 +206,24 @@ pub enum ParseError {
     AnotherRobot,
 }
 
+impl From<ReadError> for ParseError {
+    fn from(error: ReadError) -> Self {
+        match error {
+            ReadError::Malformed => Self::Metadata,
+            ReadError::Unsupported => Self::Unsupported,
+        }
+    }
+}
+
 impl From<ModelError> for ParseError {
     fn from(error: ModelError) -> Self {
         Self::Model(error)
+    }
+}
+
+impl From<DictionaryError> for ParseError {
+    fn from(error: DictionaryError) -> Self {
+        Self::Model(ModelError::Dictionary(error))
     }
 }
 
@@ -230,26 +276,37 @@ impl<'a> SelfTest<'a> {
     /// # Errors
     /// As [`Predictor::step`].
     pub fn predict(&self, model: &Model<'_>, out: &mut [f32]) -> Result<(), PredictError> {
+        self.predict_in(model, &mut PredictorState::new(), out)
+    }
+
+    /// The same in a state that has seen nothing of this model.
+    fn predict_in(
+        &self,
+        model: &Model<'_>,
+        state: &mut PredictorState,
+        out: &mut [f32],
+    ) -> Result<(), PredictError> {
         let structure = model.structure();
         let m = structure.inputs().len();
         let predictor = Predictor::new(model);
-        let mut state = PredictorState::new();
+        state.clear();
         let mut inputs = self.inputs.chunks_exact(m.max(1));
         let mut applied: &[f32] = &[];
         for states in self.states.chunks_exact(structure.states().len().max(1)) {
-            predictor.observe(&mut state, applied, states)?;
+            predictor.observe(state, applied, states)?;
             applied = inputs.next().unwrap_or(&[]);
         }
-        predictor.step(&mut state, applied)?;
-        predictor.coordinates(&state, out)
+        predictor.step(state, applied)?;
+        predictor.coordinates(state, out)
     }
 
     /// The first coordinate that the model does not predict within the tolerance.
-    fn failure(&self, model: &Model<'_>) -> Option<usize> {
+    #[inline(never)]
+    fn failure(&self, model: &Model<'_>, state: &mut PredictorState) -> Option<usize> {
         let states = model.structure().states();
         let mut predicted = [0.0; MAX_STATES];
         let predicted = predicted.get_mut(..states.len())?;
-        if self.predict(model, predicted).is_err() {
+        if self.predict_in(model, state, predicted).is_err() {
             return Some(states.len());
         }
         let expected = self.expected.iter().zip(self.tolerance);
@@ -266,11 +323,7 @@ impl<'a> SelfTest<'a> {
 /// # Errors
 /// [`ParseError`] names the first thing that is wrong.
 pub fn parse(bytes: &[u8]) -> Result<Model<'_>, ParseError> {
-    let expected = length(bytes)?;
-    if bytes.len() > expected {
-        return Err(ParseError::Trailing { expected, found: bytes.len() });
-    }
-    parse_prefix(bytes)
+    returned(bytes, Extent::Exact)
 }
 
 /// [`parse`], refusing the model of another robot.
@@ -290,81 +343,170 @@ pub fn parse_for<'a>(robot: &str, bytes: &'a [u8]) -> Result<Model<'a>, ParseErr
 /// # Errors
 /// As [`parse`].
 pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
-    if !slot.as_ptr().addr().is_multiple_of(4) {
-        return Err(ParseError::Misaligned);
-    }
-    let total = length(slot)?;
-    let truncated = ParseError::Truncated { expected: total, found: slot.len() };
-    let blob = slot.get(..total).ok_or(truncated)?;
-    let (expected, found) = (read_u32(blob, 12), checksum(blob));
-    if expected != found {
-        return Err(ParseError::Checksum { expected, found });
-    }
-    match Sections::new(blob) {
-        Ok(sections) => read_model(&sections),
-        Err(error) => Err(error),
-    }
+    returned(slot, Extent::Prefix)
 }
 
-// A model is kilobytes, and so are the parts that it is made of. Below, every part is made in a frame of
-// its own, which is off the stack when the next one begins, and results are passed on as they are: what
-// is unwrapped and wrapped again is there twice.
+/// Which of the bytes are the blob.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Extent {
+    /// All.
+    Exact,
+    /// Those at the beginning.
+    Prefix,
+}
 
-/// The model of a blob whose sections are there.
 #[inline(never)]
-fn read_model<'a>(sections: &Sections<'a>) -> Result<Model<'a>, ParseError> {
-    match read_structure(sections) {
-        Ok(structure) => {
-            let coefficients = sections.numbers(COEFFICIENTS)?;
-            let ranges = present(sections.numbers(RANGES))?;
-            let terms = present(sections.terms())?;
-            Model::join(structure, terms, coefficients, ranges, |model| complete(model, sections))
-        }
-        Err(error) => Err(error),
+fn returned(bytes: &[u8], extent: Extent) -> Result<Model<'_>, ParseError> {
+    // The model is made where the result is returned, and not moved there.
+    let mut parsed = Ok(Model::empty());
+    if let Ok(model) = &mut parsed
+        && let Err(error) = load_alone(bytes, extent, model)
+    {
+        parsed = Err(error);
     }
+    parsed
 }
 
-/// The metadata, checked.
+/// [`parse`] into a model that is there already, with a state to try the stored prediction in: what
+/// takes the least stack. The state is a new one afterwards, and of bytes that are refused the model is
+/// [empty](Model::empty).
+///
+/// # Errors
+/// As [`parse`].
+pub fn parse_into<'a>(
+    bytes: &'a [u8],
+    model: &mut Model<'a>,
+    state: &mut PredictorState,
+) -> Result<(), ParseError> {
+    load(bytes, Extent::Exact, model, state)
+}
+
+/// The same with a state of its own.
 #[inline(never)]
-fn read_structure<'a>(sections: &Sections<'a>) -> Result<Structure<'a>, ParseError> {
-    let mut reader = postcard::Deserializer::from_bytes(sections.bytes(METADATA)?);
-    match read_metadata(&mut reader) {
-        Ok(repr) => match reader.finalize() {
-            Ok([]) => Structure::check(repr),
-            _ => Err(ParseError::Metadata),
-        },
-        // What serde and heapless refuse although the bytes are postcard.
-        Err(postcard::Error::SerdeDeCustom) => Err(ParseError::Unsupported),
-        Err(_) => Err(ParseError::Metadata),
+fn load_alone<'a>(
+    bytes: &'a [u8],
+    extent: Extent,
+    model: &mut Model<'a>,
+) -> Result<(), ParseError> {
+    load(bytes, extent, model, &mut PredictorState::new())
+}
+
+// What is made below is made where it belongs, and nothing that is large is passed by value: a model is
+// kilobytes. Every part has a frame of its own, which is off the stack when the next one begins.
+
+/// Loads a blob. (`?` would copy every error on its way.)
+#[inline(always)]
+fn load<'a>(
+    bytes: &'a [u8],
+    extent: Extent,
+    model: &mut Model<'a>,
+    state: &mut PredictorState,
+) -> Result<(), ParseError> {
+    let mut sections = Sections { blob: &[], table: &[] };
+    let mut loaded = whole(bytes, extent, &mut sections);
+    if loaded.is_ok() {
+        loaded = match sections.bytes(METADATA) {
+            Some(bytes) => model.structure_mut().read(bytes).map_err(ParseError::from),
+            None => Err(ParseError::MissingSection { kind: METADATA.0 }),
+        };
     }
+    if loaded.is_ok() {
+        loaded = model.structure_mut().check();
+    }
+    if loaded.is_ok() {
+        model.structure_mut().lay_out();
+        loaded = take_terms(&sections, model);
+    }
+    if loaded.is_ok() {
+        loaded = model.lay_out();
+    }
+    if loaded.is_ok() {
+        loaded = take_numbers(&sections, model);
+    }
+    if loaded.is_ok() {
+        loaded = take_error_bounds(&sections, model);
+    }
+    if loaded.is_ok() {
+        loaded = try_prediction(&sections, model, state);
+    }
+    if loaded.is_err() {
+        model.clear();
+    }
+    state.clear();
+    loaded
 }
 
-/// The metadata as they are.
+/// Terms, once it is clear that the sections of all numbers can be read.
 #[inline(never)]
-fn read_metadata<'a>(
-    reader: &mut postcard::Deserializer<'a, postcard::de_flavors::Slice<'a>>,
-) -> postcard::Result<ModelRepr<'a>> {
-    ModelRepr::deserialize(reader)
+fn take_terms<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
+    sections.required::<f32>(COEFFICIENTS)?;
+    sections.optional::<f32>(RANGES)?;
+    let terms = sections.optional(TERMS)?;
+    model.take_terms(terms).map_err(|error| ModelError::Sparse(error).into())
 }
 
-/// Gives the model its error bounds, if it has any, and tries the stored prediction.
 #[inline(never)]
-fn complete<'a>(model: &mut Model<'a>, sections: &Sections<'a>) -> Result<(), ParseError> {
-    if let Some(words) = present(sections.words(ERROR_BOUNDS))? {
+fn take_numbers<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
+    let (coefficients, ranges) = (sections.required(COEFFICIENTS)?, sections.optional(RANGES)?);
+    Ok(model.take_numbers(coefficients, ranges)?)
+}
+
+/// Error bounds, if there are any.
+#[inline(never)]
+fn take_error_bounds<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
+    if let Some(words) = sections.optional(ERROR_BOUNDS)? {
         let bounds = error_bounds(model.structure().states().len(), words)?;
-        model.set_error_bounds(bounds).map_err(ParseError::Model)?;
+        model.set_error_bounds(bounds)?;
     }
-    let numbers = sections.numbers(SELF_TEST)?;
+    Ok(())
+}
+
+/// Tries the stored prediction.
+#[inline(never)]
+fn try_prediction(
+    sections: &Sections<'_>,
+    model: &Model<'_>,
+    state: &mut PredictorState,
+) -> Result<(), ParseError> {
+    let numbers = sections.required(SELF_TEST)?;
     let wrong = ParseError::SectionLength {
         kind: SELF_TEST.0,
         expected: SelfTest::len(model.structure()).saturating_mul(4),
         found: numbers.len().saturating_mul(4),
     };
     let self_test = SelfTest::split(model.structure(), numbers).ok_or(wrong)?;
-    match self_test.failure(model) {
+    match self_test.failure(model, state) {
         None => Ok(()),
         Some(coordinate) => Err(ParseError::SelfTest { coordinate }),
     }
+}
+
+/// The sections of a blob whose checksum and section table hold.
+#[inline(never)]
+fn whole<'a>(
+    slot: &'a [u8],
+    extent: Extent,
+    sections: &mut Sections<'a>,
+) -> Result<(), ParseError> {
+    let is_aligned = slot.as_ptr().addr().is_multiple_of(4);
+    if extent == Extent::Prefix && !is_aligned {
+        return Err(ParseError::Misaligned);
+    }
+    let total = length(slot)?;
+    if extent == Extent::Exact && slot.len() > total {
+        return Err(ParseError::Trailing { expected: total, found: slot.len() });
+    }
+    if !is_aligned {
+        return Err(ParseError::Misaligned);
+    }
+    let truncated = ParseError::Truncated { expected: total, found: slot.len() };
+    let blob = slot.get(..total).ok_or(truncated)?;
+    let (expected, found) = (read_u32(blob, 12), checksum(blob));
+    if expected != found {
+        return Err(ParseError::Checksum { expected, found });
+    }
+    *sections = Sections::new(blob)?;
+    Ok(())
 }
 
 /// The prediction stored in a blob that [`parse`] accepts.
@@ -373,7 +515,7 @@ fn complete<'a>(model: &mut Model<'a>, sections: &Sections<'a>) -> Result<(), Pa
 /// As [`parse`].
 pub fn self_test(bytes: &[u8]) -> Result<SelfTest<'_>, ParseError> {
     let model = parse(bytes)?;
-    let numbers = Sections::new(bytes)?.numbers(SELF_TEST)?;
+    let numbers = Sections::new(bytes)?.required(SELF_TEST)?;
     SelfTest::split(model.structure(), numbers)
         .ok_or(ParseError::MissingSection { kind: SELF_TEST.0 })
 }
@@ -416,10 +558,8 @@ pub fn length(bytes: &[u8]) -> Result<usize, ParseError> {
 }
 
 fn checksum(blob: &[u8]) -> u32 {
-    let mut digest = CRC.digest();
-    digest.update(blob.get(..12).unwrap_or(&[]));
-    digest.update(blob.get(HEADER..).unwrap_or(&[]));
-    digest.finalize()
+    let head = crc32(0, blob.get(..12).unwrap_or(&[]));
+    crc32(head, blob.get(HEADER..).unwrap_or(&[]))
 }
 
 fn read_u16(bytes: &[u8], offset: usize) -> u16 {
@@ -471,44 +611,43 @@ impl<'a> Sections<'a> {
     }
 
     /// The bytes of a section; one of another encoding counts as missing.
-    fn bytes(&self, section: (u16, u16)) -> Result<&'a [u8], ParseError> {
-        let missing = ParseError::MissingSection { kind: section.0 };
+    #[inline(never)]
+    fn bytes(&self, (kind, encoding): (u16, u16)) -> Option<&'a [u8]> {
         let mut table = self.table.iter();
-        let entry = table.find(|e| (read_u16(*e, 0), read_u16(*e, 2)) == section).ok_or(missing)?;
+        let entry = table.find(|e| (read_u16(*e, 0), read_u16(*e, 2)) == (kind, encoding))?;
         let offset = usize::try_from(read_u32(entry, 4)).unwrap_or(usize::MAX);
         let length = usize::try_from(read_u32(entry, 8)).unwrap_or(usize::MAX);
-        self.blob.get(offset..offset.saturating_add(length)).ok_or(ParseError::SectionTable)
+        self.blob.get(offset..offset.saturating_add(length))
     }
 
-    fn numbers(&self, section: (u16, u16)) -> Result<&'a [f32], ParseError> {
-        self.cast(section)
+    /// A section as whole elements, in place, if there is one.
+    #[inline]
+    fn optional<T: bytemuck::AnyBitPattern>(
+        &self,
+        section: (u16, u16),
+    ) -> Result<Option<&'a [T]>, ParseError> {
+        self.bytes(section).map(|bytes| elements(section.0, bytes)).transpose()
     }
 
-    fn words(&self, section: (u16, u16)) -> Result<&'a [u32], ParseError> {
-        self.cast(section)
-    }
-
-    fn terms(&self) -> Result<&'a [[u8; 2]], ParseError> {
-        self.cast(TERMS)
-    }
-
-    /// The bytes of a section as whole elements, in place.
-    fn cast<T: bytemuck::AnyBitPattern>(&self, section: (u16, u16)) -> Result<&'a [T], ParseError> {
-        let bytes = self.bytes(section)?;
-        bytemuck::try_cast_slice(bytes).map_err(|_| ParseError::SectionLength {
-            kind: section.0,
-            expected: bytes.len().next_multiple_of(size_of::<T>()),
-            found: bytes.len(),
-        })
+    /// A section that has to be there.
+    #[inline]
+    fn required<T: bytemuck::AnyBitPattern>(
+        &self,
+        section: (u16, u16),
+    ) -> Result<&'a [T], ParseError> {
+        match self.bytes(section) {
+            Some(bytes) => elements(section.0, bytes),
+            None => Err(ParseError::MissingSection { kind: section.0 }),
+        }
     }
 }
 
-/// Leaves a section that may be missing to the reader.
-fn present<T>(section: Result<T, ParseError>) -> Result<Option<T>, ParseError> {
-    match section {
-        Err(ParseError::MissingSection { .. }) => Ok(None),
-        other => other.map(Some),
-    }
+/// The bytes of a section as whole elements, in place.
+#[inline]
+fn elements<T: bytemuck::AnyBitPattern>(kind: u16, bytes: &[u8]) -> Result<&[T], ParseError> {
+    let (expected, found) = (bytes.len().next_multiple_of(size_of::<T>()), bytes.len());
+    let wrong = |_| ParseError::SectionLength { kind, expected, found };
+    bytemuck::try_cast_slice(bytes).map_err(wrong)
 }
 
 /// Cuts the section of the error bounds into its parts.
@@ -665,5 +804,27 @@ impl Writer<'_> {
 fn write(out: &mut [u8], offset: usize, bytes: &[u8]) {
     for (to, byte) in out.iter_mut().skip(offset).zip(bytes) {
         *to = *byte;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crc::{CRC_32_ISO_HDLC, Crc};
+    use proptest::prelude::*;
+
+    #[test]
+    fn checksum_of_the_catalogue() {
+        assert_eq!(crc32(0, b"123456789"), 0xCBF4_3926);
+        assert_eq!(crc32(0, &[]), 0);
+    }
+
+    proptest! {
+        #[test]
+        fn checksums(bytes in prop::collection::vec(any::<u8>(), 0..70), at: prop::sample::Index) {
+            let (head, tail) = bytes.split_at(at.index(bytes.len() + 1));
+            let expected = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&bytes);
+            prop_assert_eq!(crc32(crc32(0, head), tail), expected);
+        }
     }
 }

@@ -82,9 +82,9 @@ impl<S: Scalar> History<S> {
         self.filled == 0
     }
 
-    /// Forgets all samples.
+    /// Forgets all samples, and which model they were of.
     pub fn clear(&mut self) {
-        self.filled = 0;
+        (self.layout, self.kept, self.filled) = (0, (0, 0), 0);
     }
 
     /// How many samples there are for a model of this layout.

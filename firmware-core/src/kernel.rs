@@ -457,97 +457,136 @@ pub(crate) struct Program {
     powers: u8,
 }
 
+/// A register, as far as it is one: that there are too many is noticed at the end.
+fn byte(register: usize) -> u8 {
+    u8::try_from(register).unwrap_or(NOWHERE)
+}
+
+/// Functions of a sparse model whose registers are looked up at once while its program is made.
+const TABLE: usize = 32;
+
 impl Program {
-    /// Of a structure and the terms that have been checked against its dictionary.
-    pub(crate) fn new(
-        structure: &Structure<'_>,
-        terms: Option<SparseTerms<'_>>,
-    ) -> Result<Self, ModelError> {
-        let (layout, dictionary) = (structure.layout(), structure.dictionary());
-        let mut program = Self {
-            first: layout.end,
+    /// Of nothing.
+    pub(crate) const fn empty() -> Self {
+        Self {
+            first: 0,
             scaled: Vec::new(),
             harmonics: Vec::new(),
             products: Vec::new(),
             powers: 0,
-        };
-        let mut next = usize::from(layout.end);
-        // Registers beyond the last are noticed at the end.
-        let byte = |register: usize| u8::try_from(register).unwrap_or(NOWHERE);
-        let mut registers: Vec<u8, MAX_OBSERVABLES> = Vec::new();
+        }
+    }
+
+    pub(crate) fn clear(&mut self) {
+        (self.first, self.powers) = (0, 0);
+        self.scaled.clear();
+        self.harmonics.clear();
+        self.products.clear();
+    }
+
+    /// Becomes that of a structure and the terms that have been checked against its dictionary. It is
+    /// made where it lies: on the stack it would take a kilobyte.
+    #[inline(never)]
+    pub(crate) fn fill<E: From<ModelError>>(
+        &mut self,
+        structure: &Structure<'_>,
+        terms: Option<SparseTerms<'_>>,
+    ) -> Result<(), E> {
+        let (layout, dictionary) = (structure.layout(), structure.dictionary());
+        self.clear();
+        let Self { first, scaled, harmonics, products, powers } = self;
+        *first = layout.end;
         let observables = dictionary.observables().iter().zip(&layout.observables);
         for (index, (o, register)) in observables.enumerate() {
-            let mut register = *register;
             if terms.is_none() || (o.centre, o.gain) != (0.0, 1.0) {
-                let _ = program.scaled.push([index as u8, register]);
-                register = byte(next);
-                next = next.saturating_add(1);
+                let _ = scaled.push([index as u8, *register]);
             }
-            let _ = registers.push(register);
         }
+        let mut next = usize::from(*first).saturating_add(scaled.len());
         let Some(terms) = terms else {
             return if next <= REGISTERS {
-                Ok(program)
+                Ok(())
             } else {
-                let (field, capacity) = ("registers", REGISTERS);
-                let found = next;
-                Err(ModelError::Dictionary(DictionaryError::TooLarge { field, capacity, found }))
+                let (field, capacity, found) = ("registers", REGISTERS, next);
+                Err(ModelError::Dictionary(DictionaryError::TooLarge { field, capacity, found })
+                    .into())
             };
         };
-        // The register of every function, in order.
-        let mut functions: Vec<u8, MAX_FUNCTIONS> = Vec::new();
-        let factors = dictionary.factors().iter();
-        for factor in factors.clone() {
-            let (v, behind) = observable_pair(*factor, &registers);
-            let _ = functions.push(v);
-            if factor.basis == Basis::Fourier {
-                let _ = functions.push(behind);
-                if factor.order > 1 {
-                    let (sin, cos, order) = (v, behind, factor.order);
-                    let _ = program.harmonics.push(Harmonics { sin, cos, order });
-                }
+        let factors = dictionary.factors();
+        let observed = |observable: u8| {
+            // They are in order, so that it cannot be further behind.
+            let own = scaled.get(..=usize::from(observable)).unwrap_or(scaled);
+            match own.iter().rposition(|[index, _]| *index == observable) {
+                Some(place) => first.saturating_add(place as u8),
+                None => layout.observables.get(usize::from(observable)).copied().unwrap_or(NOWHERE),
             }
-            for _ in 1..factor.order {
-                for _ in 0..if factor.basis == Basis::Fourier { 2 } else { 0 } {
-                    let _ = functions.push(byte(next));
-                    next = next.saturating_add(1);
-                }
-                if factor.basis == Basis::Hermite {
-                    // Its register is not known yet.
-                    let _ = functions.push(NOWHERE);
-                }
-            }
+        };
+        let first_harmonic = next;
+        for factor in factors.iter().filter(|f| f.basis == Basis::Fourier && f.order > 1) {
+            let (sin, cos) =
+                (observed(factor.observable), observed(factor.observable.saturating_add(1)));
+            let order = factor.order;
+            let _ = harmonics.push(Harmonics { sin, cos, order });
+            next = next.saturating_add(usize::from(order).saturating_sub(1).saturating_mul(2));
         }
-        let mut place = functions.iter_mut();
-        for factor in factors {
-            let mut functions = place.by_ref().take(factor.radix().saturating_sub(1));
-            let Some(v) = functions.next().copied() else { continue };
+        let first_power = next;
+        for factor in factors.iter().filter(|f| f.basis == Basis::Hermite) {
+            let v = observed(factor.observable);
             let mut power = v;
-            for function in functions {
-                if factor.basis == Basis::Hermite {
-                    let _ = program.products.push([power, v]);
-                    power = byte(next);
-                    *function = power;
-                    next = next.saturating_add(1);
-                }
+            for _ in 1..factor.order {
+                let _ = products.push([power, v]);
+                power = byte(next);
+                next = next.saturating_add(1);
             }
         }
-        program.powers = program.products.len() as u8;
+        *powers = products.len() as u8;
         let first_term = next;
-        for [parent, function] in terms.entries() {
+        for [parent, _] in terms.entries() {
             let parent = match parent.checked_sub(1) {
                 None => ONE,
                 Some(earlier) => byte(first_term.saturating_add(earlier.into())),
             };
-            let function = functions.get(usize::from(*function)).copied().unwrap_or(NOWHERE);
-            let _ = program.products.push([parent, function]);
+            // The register of its function follows.
+            let _ = products.push([parent, NOWHERE]);
             next = next.saturating_add(1);
         }
         if next > REGISTERS {
             let (field, capacity, found) = ("registers", REGISTERS, next);
-            return Err(ModelError::Sparse(SparseError::TooLarge { field, capacity, found }));
+            return Err(ModelError::Sparse(SparseError::TooLarge { field, capacity, found }).into());
         }
-        Ok(program)
+        // Some functions at a time: the registers of all would be half of what loading takes of the stack.
+        for from in (0..dictionary.functions()).step_by(TABLE) {
+            let mut table = [NOWHERE; TABLE];
+            let mut function = 0_usize;
+            let mut put = |register| {
+                let place = function.checked_sub(from).and_then(|place| table.get_mut(place));
+                place.into_iter().for_each(|place| *place = register);
+                function = function.saturating_add(1);
+            };
+            let (mut harmonic, mut power) = (first_harmonic, first_power);
+            for factor in factors {
+                put(observed(factor.observable));
+                let (next, others) = match factor.basis {
+                    Basis::Hermite => (&mut power, 2),
+                    Basis::Fourier => {
+                        put(observed(factor.observable.saturating_add(1)));
+                        (&mut harmonic, 3)
+                    }
+                };
+                for _ in others..factor.radix() {
+                    put(byte(*next));
+                    *next = next.saturating_add(1);
+                }
+            }
+            let terms = products.iter_mut().skip((*powers).into()).zip(terms.entries());
+            for ([_, register], [_, function]) in terms {
+                let place = usize::from(*function).checked_sub(from);
+                if let Some(found) = place.and_then(|place| table.get(place)) {
+                    *register = *found;
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Observables that have a register of their own; returns the register behind them.

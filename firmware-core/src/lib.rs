@@ -33,6 +33,7 @@
 //! | [`model`] | `ModelRepr` (what the bytes say), `Structure` and `Model` (checked once) |
 //! | [`history`] | samples: from coordinates to observables, from outputs back to coordinates |
 //! | [`blob`] | the bytes of a model: layout, parse, emit |
+//! | `encoding` (private) | what postcard has written, read in place |
 //! | [`predictor`] | `Predictor` (immutable) and `PredictorState`: step, rollout, held inputs |
 //! | `registers`, `kernel` (private) | where the numbers of a step lie, and how it computes them |
 //! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
@@ -63,6 +64,7 @@ pub mod control_loop;
 pub mod cost;
 pub mod device;
 pub mod dictionary;
+mod encoding;
 pub mod error_bounds;
 pub mod history;
 mod kernel;

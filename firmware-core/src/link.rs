@@ -30,7 +30,7 @@ use heapless::{Deque, Vec};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::blob::CRC;
+use crate::blob::crc32;
 use crate::capacity::MAX_INPUTS;
 use crate::control_loop::telemetry::{Frame, Frames};
 use crate::control_loop::{Command, ControlLoop, Mode};
@@ -117,7 +117,7 @@ pub fn encode(message: &Message, out: &mut [u8]) -> Result<usize, TooLong> {
 fn encode_as(message: &impl Serialize, out: &mut [u8]) -> Result<usize, TooLong> {
     let mut plain = [0; MAX_FRAME];
     let length = postcard::to_slice(message, &mut plain).map_err(|_| TooLong)?.len();
-    let check = CRC.checksum(plain.get(..length).unwrap_or(&[]));
+    let check = crc32(0, plain.get(..length).unwrap_or(&[]));
     let end = length.saturating_add(4);
     plain.get_mut(length..end).ok_or(TooLong)?.copy_from_slice(&check.to_le_bytes());
     let plain = plain.get(..end).ok_or(TooLong)?;
@@ -198,7 +198,7 @@ impl Receiver {
 fn decode<M: DeserializeOwned>(frame: &mut [u8]) -> Option<Received<M>> {
     let length = cobs::decode_in_place(frame).ok()?;
     let (body, check) = frame.get(..length)?.split_last_chunk::<4>()?;
-    if CRC.checksum(body) != u32::from_le_bytes(*check) {
+    if crc32(0, body) != u32::from_le_bytes(*check) {
         return None;
     }
     // Bytes after a message are no part of any.

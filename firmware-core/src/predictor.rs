@@ -105,6 +105,12 @@ impl<S: Scalar> PredictorState<S> {
         Self::default()
     }
 
+    /// Forgets everything, as if new.
+    pub fn clear(&mut self) {
+        self.history.clear();
+        (self.step, self.out_of_range) = (0, None);
+    }
+
     /// Steps predicted since the last measurement.
     pub fn step(&self) -> u32 {
         self.step

@@ -163,6 +163,38 @@ pub(crate) struct Place {
     pub(crate) limit: [f32; 2],
 }
 
+impl Place {
+    /// Of coordinate `i`: whether its changes are observed, and its sine and cosine needed.
+    #[inline(never)]
+    fn of(
+        i: u8,
+        state: &State<'_>,
+        symmetry: Symmetry,
+        changes: bool,
+        trigonometric: bool,
+    ) -> Self {
+        let [low, high] = state.limit;
+        let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
+        let kind = match (state.target, state.space) {
+            (Target::Absolute, Space::Line) => Kind::Line,
+            (Target::Increment, Space::Line) => match symmetry {
+                Symmetry::Se2 { x, y, .. } if x == i || y == i => Kind::Pose,
+                _ => Kind::Increment,
+            },
+            (Target::Absolute, Space::Circle) if limited || changes => Kind::Angle,
+            (Target::Absolute, Space::Circle) => Kind::Circle,
+            (Target::Increment, Space::Circle) if trigonometric => {
+                Kind::AngleIncrementTrigonometric
+            }
+            (Target::Increment, Space::Circle) => Kind::AngleIncrement,
+        };
+        // Limits are no NaN.
+        let low = if low > f32::MIN { low } else { f32::MIN };
+        let high = if high < f32::MAX { high } else { f32::MAX };
+        Self { kind, limit: [low, high] }
+    }
+}
+
 /// Where the pose of an se(2)-symmetric model is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Pose {
@@ -212,109 +244,140 @@ const HISTORY: usize = INPUTS as usize
 const _: () = assert!(HISTORY < REGISTERS, "no index of a register that keeps something overflows");
 
 impl Layout {
-    /// Of a checked structure; `trigonometric` has a bit per coordinate whose sine and cosine are
-    /// needed.
-    pub(crate) fn new(
+    /// Of nothing.
+    pub(crate) const fn empty() -> Self {
+        Self {
+            observables: Vec::new(),
+            states: Vec::new(),
+            pose: None,
+            heads: Vec::new(),
+            increments: false,
+            inputs: 0,
+            present: INPUTS,
+            lines: INPUTS,
+            groups: 0,
+            end: INPUTS,
+            id: 0,
+        }
+    }
+
+    pub(crate) fn clear(&mut self) {
+        self.observables.clear();
+        self.states.clear();
+        self.heads.clear();
+        (self.pose, self.increments, self.inputs) = (None, false, 0);
+        (self.present, self.lines, self.groups, self.end) = (INPUTS, INPUTS, 0, INPUTS);
+        self.id = 0;
+    }
+
+    /// Becomes that of a checked structure; bit i of `trigonometric`: the sine and cosine of coordinate i
+    /// are needed. It is made where it lies, part by part: it would be a quarter of a kilobyte of stack.
+    #[inline(always)]
+    pub(crate) fn fill(
+        &mut self,
         states: &[State<'_>],
         inputs: usize,
         symmetry: Symmetry,
         observables: &[Observable],
-        trigonometric: impl Fn(usize) -> bool,
-    ) -> Self {
-        let observed = |source| observables.iter().any(|o| o.source == source);
-        let places = (0..).zip(states.iter().take(MAX_STATES)).map(|(i, state)| {
-            let [low, high] = state.limit;
-            let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
-            let kind = match (state.target, state.space) {
-                (Target::Absolute, Space::Line) => Kind::Line,
-                (Target::Increment, Space::Line) => match symmetry {
-                    Symmetry::Se2 { x, y, .. } if x == i || y == i => Kind::Pose,
-                    _ => Kind::Increment,
-                },
-                (Target::Absolute, Space::Circle) => {
-                    match limited || observed(Source::Increment(i)) {
-                        true => Kind::Angle,
-                        false => Kind::Circle,
-                    }
-                }
-                (Target::Increment, Space::Circle) => match trigonometric(i.into()) {
-                    true => Kind::AngleIncrementTrigonometric,
-                    false => Kind::AngleIncrement,
-                },
-            };
-            Place { kind, limit: [low.max(f32::MIN), high.min(f32::MAX)] }
-        });
-        let places: Vec<Place, MAX_STATES> = places.collect();
-        let present = INPUTS.saturating_add(inputs as u8);
-        let coordinate = |i: u8| present.saturating_add(i.saturating_mul(GROUP as u8));
+        trigonometric: u8,
+    ) {
+        self.inputs = inputs as u8;
+        self.present = INPUTS.saturating_add(self.inputs);
+        self.increments = observables.iter().any(|o| matches!(o.source, Source::Increment(_)));
+        self.place_states(states, symmetry, observables, trigonometric);
+        self.place_lines(observables);
+        self.pose = self.place_pose(symmetry);
+        self.identify(trigonometric);
+    }
 
-        // The register of a source at its latest sample, and the lag of that sample.
-        let latest = |source: Source| match source {
-            Source::State(i) => (coordinate(i), 0),
-            Source::Sin(i) => (coordinate(i).saturating_add(SIN), 0),
-            Source::Cos(i) => (coordinate(i).saturating_add(COS), 0),
-            Source::Increment(i) => (coordinate(i).saturating_add(CHANGE), 1),
+    /// FNV-1a of what two layouts that keep the same have in common.
+    #[inline(never)]
+    fn identify(&mut self, trigonometric: u8) {
+        let Self { present, lines, groups, .. } = *self;
+        let bytes = self.heads.iter().flatten().copied().chain([present, lines, groups]);
+        let trigonometric = (0..self.states.len()).map(|i| (trigonometric >> i) & 1);
+        self.id = bytes
+            .chain(trigonometric)
+            .fold(0x811C_9DC5, |id: u32, byte| (id ^ u32::from(byte)).wrapping_mul(0x0100_0193));
+    }
+
+    /// What becomes of the coordinates.
+    #[inline(never)]
+    fn place_states(
+        &mut self,
+        states: &[State<'_>],
+        symmetry: Symmetry,
+        observables: &[Observable],
+        trigonometric: u8,
+    ) {
+        self.states.clear();
+        for (i, state) in (0_u8..).zip(states) {
+            let changes = observables.iter().any(|o| o.source == Source::Increment(i));
+            let place = Place::of(i, state, symmetry, changes, (trigonometric >> i) & 1 != 0);
+            let _ = self.states.push(place);
+        }
+    }
+
+    /// The register of a source at its latest sample, and the lag of that sample.
+    fn latest(&self, source: Source) -> (u8, u8) {
+        match source {
+            Source::State(i) => (self.coordinate(i), 0),
+            Source::Sin(i) => (self.coordinate(i).saturating_add(SIN), 0),
+            Source::Cos(i) => (self.coordinate(i).saturating_add(COS), 0),
+            Source::Increment(i) => (self.coordinate(i).saturating_add(CHANGE), 1),
             Source::Input(i) => (INPUTS.saturating_add(i), 0),
-        };
-        let lines = coordinate(places.len() as u8);
-        let mut next = lines;
-        // The first register of the line of every source.
-        let mut heads: Vec<[u8; 2], LINES> = Vec::new();
-        let mut registers: Vec<u8, MAX_OBSERVABLES> = Vec::new();
+        }
+    }
+
+    fn coordinate(&self, i: u8) -> u8 {
+        self.present.saturating_add(i.saturating_mul(GROUP as u8))
+    }
+
+    /// The delay lines, and the register of every observable.
+    #[inline(never)]
+    fn place_lines(&mut self, observables: &[Observable]) {
+        self.lines = self.coordinate(self.states.len() as u8);
+        let mut next = self.lines;
+        self.heads.clear();
+        self.observables.clear();
         for o in observables {
-            let (from, lag) = latest(o.source);
+            let (from, lag) = self.latest(o.source);
             if o.lag <= lag {
-                let _ = registers.push(from);
+                let _ = self.observables.push(from);
                 continue;
             }
-            let head = match heads.iter().find(|[_, source]| *source == from) {
+            // The first register of the line of its source.
+            let head = match self.heads.iter().find(|[_, source]| *source == from) {
                 Some([head, _]) => *head,
                 None => {
                     let own = observables.iter().filter(|other| other.source == o.source);
                     let oldest = own.map(|o| o.lag).max().unwrap_or(lag);
-                    let _ = heads.push([next, from]);
+                    let _ = self.heads.push([next, from]);
                     let head = next;
                     next = next.saturating_add(oldest.saturating_sub(lag));
                     head
                 }
             };
-            let _ =
-                registers.push(head.saturating_add(o.lag.saturating_sub(lag)).saturating_sub(1));
+            let register = head.saturating_add(o.lag.saturating_sub(lag)).saturating_sub(1);
+            let _ = self.observables.push(register);
         }
-        let groups = next.saturating_sub(lines).div_ceil(GROUP as u8);
-        let pose = match symmetry {
-            Symmetry::Se2 { x, y, heading } => {
-                // An absolute angle has two outputs.
-                let output = |coordinate: u8| {
-                    places.iter().take(coordinate.into()).fold(0_u8, |sum, place| {
-                        sum.saturating_add(1).saturating_add(place.kind.absolute_angle().into())
-                    })
-                };
-                let ((sin, _), (cos, _)) =
-                    (latest(Source::Sin(heading)), latest(Source::Cos(heading)));
-                Some(Pose { x, y, ahead: output(x), left: output(y), sin, cos })
-            }
-            _ => None,
+        self.groups = next.saturating_sub(self.lines).div_ceil(GROUP as u8);
+        self.end = self.lines.saturating_add(self.groups.saturating_mul(GROUP as u8));
+    }
+
+    /// Where the pose is, if the symmetry has one.
+    #[inline(never)]
+    fn place_pose(&self, symmetry: Symmetry) -> Option<Pose> {
+        let Symmetry::Se2 { x, y, heading } = symmetry else { return None };
+        // An absolute angle has two outputs.
+        let output = |coordinate: u8| {
+            self.states.iter().take(coordinate.into()).fold(0_u8, |sum, place| {
+                sum.saturating_add(1).saturating_add(place.kind.absolute_angle().into())
+            })
         };
-        let bytes = heads.iter().flatten().copied().chain([present, lines, groups]);
-        let trigonometric = (0..places.len()).map(|i| trigonometric(i).into());
-        // FNV-1a.
-        let id = bytes
-            .chain(trigonometric)
-            .fold(0x811C_9DC5, |id: u32, byte| (id ^ u32::from(byte)).wrapping_mul(0x0100_0193));
-        Self {
-            observables: registers,
-            states: places,
-            pose,
-            heads,
-            increments: (0..states.len() as u8).any(|i| observed(Source::Increment(i))),
-            inputs: inputs as u8,
-            present,
-            lines,
-            groups,
-            end: lines.saturating_add(groups.saturating_mul(GROUP as u8)),
-            id,
-        }
+        let ((sin, _), (cos, _)) =
+            (self.latest(Source::Sin(heading)), self.latest(Source::Cos(heading)));
+        Some(Pose { x, y, ahead: output(x), left: output(y), sin, cos })
     }
 
     /// Inputs of the model.

@@ -87,7 +87,7 @@ use embedded_storage::nor_flash::{NorFlash, ReadNorFlash};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::blob::CRC;
+use crate::blob::crc32;
 
 /// First bytes of a slot with a header.
 pub const MAGIC: [u8; 4] = *b"SLOT";
@@ -117,7 +117,7 @@ const _: () = assert!(RECORD == HEADER + 4 * 2 * CELL && BUFFER.is_multiple_of(C
 /// assert_eq!(firmware_core::slots::robot("rosbot"), 0x6B9E_3F84);
 /// ```
 pub fn robot(name: &str) -> u32 {
-    CRC.checksum(name.as_bytes())
+    crc32(0, name.as_bytes())
 }
 
 /// The hash of a payload, as in a header.
@@ -399,7 +399,7 @@ impl Header {
         put(&self.sha256);
         put(&[0; 4]);
         if let Some((body, check)) = bytes.split_last_chunk_mut::<4>() {
-            *check = CRC.checksum(body).to_le_bytes();
+            *check = crc32(0, body).to_le_bytes();
         }
         bytes
     }
@@ -432,7 +432,7 @@ struct Unreadable;
 
 /// CRC-32 of a header's bytes but the last four.
 fn check_of(header: &[u8]) -> u32 {
-    CRC.checksum(header.split_last_chunk::<4>().map_or(&[], |(body, _)| body))
+    crc32(0, header.split_last_chunk::<4>().map_or(&[], |(body, _)| body))
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -2,8 +2,7 @@
 
 use core::ffi::{c_char, c_void};
 
-use firmware_core::Model;
-use firmware_core::blob;
+use firmware_core::{Model, PredictorState, blob};
 
 use crate::error::answer;
 use crate::error::koopman_error_t::{self, *};
@@ -83,14 +82,16 @@ pub unsafe extern "C" fn koopman_load(
         // SAFETY: `room` was asked; the rest is the caller's word.
         unsafe { Marked::<Loaded>::clear(model)? };
         let bytes = bytes?;
-        let parsed = firmware_core::parse(bytes);
-        let loaded = parsed.as_ref().map_err(|error| *error)?;
+        // SAFETY: as above.
+        let loaded = unsafe { Marked::<Loaded>::place(model, Model::empty)? };
+        blob::parse_into(bytes, loaded, &mut PredictorState::new())?;
         // SAFETY: the caller's word.
         if !(robot.is_null() || unsafe { is_text(robot, loaded.structure().robot()) }) {
             return Err(KOOPMAN_ERROR_ANOTHER_ROBOT);
         }
-        // SAFETY: as above; a model owns nothing.
-        unsafe { Marked::write(model, MARK, loaded) }
+        // SAFETY: it was placed there.
+        unsafe { Marked::<Loaded>::mark(model, MARK) };
+        Ok(())
     })
 }
 

@@ -1,0 +1,133 @@
+//! Reading what postcard has written, one field after the other, straight to where it belongs.
+//!
+//! serde makes a value and moves it, and what a model is made of is kilobytes: on a controller that is
+//! stack and time. The bytes are postcard's all the same (its specification: integers of one byte as they
+//! are; lengths and variants as varints; `f32` as four bytes, little-endian; text and lists behind their
+//! length), and whatever serde refuses is refused here, for the same reason: see the tests.
+
+use heapless::Vec;
+
+/// Why bytes are not what was to be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum ReadError {
+    /// They end too early or too late, or hold a length or a text that is none.
+    Malformed,
+    /// A list is longer than there is room for, or a variant is not known.
+    Unsupported,
+}
+
+/// Bytes to be read from the front.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Reader<'a> {
+    rest: &'a [u8],
+}
+
+impl<'a> Reader<'a> {
+    pub(crate) fn new(bytes: &'a [u8]) -> Self {
+        Self { rest: bytes }
+    }
+
+    /// Nothing may be left.
+    pub(crate) fn end(self) -> Result<(), ReadError> {
+        if self.rest.is_empty() { Ok(()) } else { Err(ReadError::Malformed) }
+    }
+
+    #[inline(always)]
+    pub(crate) fn byte(&mut self) -> Result<u8, ReadError> {
+        let (byte, rest) = self.rest.split_first().ok_or(ReadError::Malformed)?;
+        self.rest = rest;
+        Ok(*byte)
+    }
+
+    #[inline(always)]
+    pub(crate) fn array<const N: usize>(&mut self) -> Result<[u8; N], ReadError> {
+        let (array, rest) = self.rest.split_first_chunk().ok_or(ReadError::Malformed)?;
+        self.rest = rest;
+        Ok(*array)
+    }
+
+    #[inline(always)]
+    pub(crate) fn number(&mut self) -> Result<f32, ReadError> {
+        self.array().map(f32::from_le_bytes)
+    }
+
+    #[inline(always)]
+    pub(crate) fn numbers<const N: usize>(&mut self) -> Result<[f32; N], ReadError> {
+        let mut numbers = [0.0; N];
+        for number in &mut numbers {
+            *number = self.number()?;
+        }
+        Ok(numbers)
+    }
+
+    /// An integer of so many bits.
+    #[inline(never)]
+    fn varint(&mut self, bits: u32) -> Result<usize, ReadError> {
+        let (mut value, mut shift) = (0_usize, 0_u32);
+        while shift < bits {
+            let byte = self.byte()?;
+            let digit = usize::from(byte & 0x7F);
+            // The last byte has bits of its own only as far as the integer has.
+            let left = bits.saturating_sub(shift);
+            if left < 7 && digit.checked_shr(left).unwrap_or(0) != 0 {
+                return Err(ReadError::Malformed);
+            }
+            value |= digit.checked_shl(shift).unwrap_or(0);
+            if byte < 0x80 {
+                return Ok(value);
+            }
+            shift = shift.saturating_add(7);
+        }
+        Err(ReadError::Malformed)
+    }
+
+    /// An integer that is a byte as a rule.
+    #[inline(always)]
+    pub(crate) fn word(&mut self) -> Result<u32, ReadError> {
+        match self.rest.split_first() {
+            Some((byte, rest)) if *byte < 0x80 => {
+                self.rest = rest;
+                Ok((*byte).into())
+            }
+            _ => Ok(self.varint(u32::BITS)? as u32),
+        }
+    }
+
+    #[inline(always)]
+    fn length(&mut self) -> Result<usize, ReadError> {
+        match self.rest.split_first() {
+            Some((byte, rest)) if *byte < 0x80 => {
+                self.rest = rest;
+                Ok((*byte).into())
+            }
+            _ => self.varint(usize::BITS),
+        }
+    }
+
+    /// Bytes behind their length, in place.
+    pub(crate) fn bytes(&mut self) -> Result<&'a [u8], ReadError> {
+        let length = self.length()?;
+        let (bytes, rest) = self.rest.split_at_checked(length).ok_or(ReadError::Malformed)?;
+        self.rest = rest;
+        Ok(bytes)
+    }
+
+    /// A text, in place.
+    pub(crate) fn text(&mut self) -> Result<&'a str, ReadError> {
+        core::str::from_utf8(self.bytes()?).map_err(|_| ReadError::Malformed)
+    }
+
+    /// A list, over the one that is there. No element is empty, so that the bytes bound the work.
+    #[inline(always)]
+    pub(crate) fn list<T, const N: usize>(
+        &mut self,
+        to: &mut Vec<T, N>,
+        element: impl Fn(&mut Self) -> Result<T, ReadError>,
+    ) -> Result<(), ReadError> {
+        to.clear();
+        for _ in 0..self.length()? {
+            to.push(element(self)?).map_err(|_| ReadError::Unsupported)?;
+        }
+        Ok(())
+    }
+}
