@@ -1,9 +1,10 @@
-//! Reading what postcard has written, one field after the other, straight to where it belongs.
+//! Postcard on a controller: reading what it has written, one field after the other, straight to where it
+//! belongs, and writing the same bytes.
 //!
 //! serde makes a value and moves it, and what a model is made of is kilobytes: on a controller that is
-//! stack and time. The bytes are postcard's all the same (its specification: integers of one byte as they
+//! stack and time, and code of its own for every field of every message. The bytes are postcard's all the same (its specification: integers of one byte as they
 //! are; lengths and variants as varints; `f32` as four bytes, little-endian; text and lists behind their
-//! length), and whatever serde refuses is refused here, for the same reason: see the tests.
+//! length), and whatever serde refuses is refused here, for the same reason: the tests hold both against each other.
 
 use heapless::Vec;
 
@@ -129,5 +130,70 @@ impl<'a> Reader<'a> {
             to.push(element(self)?).map_err(|_| ReadError::Unsupported)?;
         }
         Ok(())
+    }
+}
+
+/// Bytes that are written one after the other. What has no room is missing, and [`written`](Self::written)
+/// says so in the end: no field has to be checked.
+pub(crate) struct Writer<const N: usize> {
+    bytes: [u8; N],
+    length: usize,
+}
+
+impl<const N: usize> Writer<N> {
+    pub(crate) fn new() -> Self {
+        Self { bytes: [0; N], length: 0 }
+    }
+
+    /// All bytes, unless some had no room.
+    pub(crate) fn written(&self) -> Option<&[u8]> {
+        self.bytes.get(..self.length)
+    }
+
+    #[inline(never)]
+    pub(crate) fn byte(&mut self, byte: u8) {
+        if let Some(place) = self.bytes.get_mut(self.length) {
+            *place = byte;
+        }
+        self.length = self.length.saturating_add(1);
+    }
+
+    /// Bytes as they are.
+    #[inline(never)]
+    pub(crate) fn array(&mut self, bytes: &[u8]) {
+        for byte in bytes {
+            self.byte(*byte);
+        }
+    }
+
+    /// A varint.
+    #[inline(never)]
+    pub(crate) fn word(&mut self, value: u32) {
+        self.long(value.into());
+    }
+
+    #[inline(never)]
+    pub(crate) fn long(&mut self, value: u64) {
+        let mut rest = value;
+        while rest >= 0x80 {
+            self.byte(rest as u8 | 0x80);
+            rest >>= 7;
+        }
+        self.byte(rest as u8);
+    }
+
+    /// Bytes, or a text, behind their length.
+    #[inline(never)]
+    pub(crate) fn bytes(&mut self, bytes: &[u8]) {
+        self.long(bytes.len() as u64);
+        self.array(bytes);
+    }
+
+    #[inline(never)]
+    pub(crate) fn numbers(&mut self, numbers: &[f32]) {
+        self.long(numbers.len() as u64);
+        for number in numbers {
+            self.array(&number.to_le_bytes());
+        }
     }
 }

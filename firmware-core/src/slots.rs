@@ -88,6 +88,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::blob::crc32;
+use crate::encoding::{ReadError, Reader, Writer};
 
 /// First bytes of a slot with a header.
 pub const MAGIC: [u8; 4] = *b"SLOT";
@@ -279,6 +280,21 @@ impl Release {
     pub fn new(name: &str, sequence: u32, payload: &[u8]) -> Option<Self> {
         let length = u32::try_from(payload.len()).ok()?;
         Some(Self { length, sha256: sha256(payload), sequence, robot: robot(name) })
+    }
+}
+
+impl Release {
+    /// As postcard has it.
+    pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self, ReadError> {
+        let (length, sha256) = (reader.word()?, reader.array()?);
+        Ok(Self { length, sha256, sequence: reader.word()?, robot: reader.word()? })
+    }
+
+    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
+        to.word(self.length);
+        to.array(&self.sha256);
+        to.word(self.sequence);
+        to.word(self.robot);
     }
 }
 

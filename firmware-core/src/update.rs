@@ -159,6 +159,7 @@ use crate::capacity::{
 };
 use crate::control_loop::{Alarms, Mode};
 use crate::cost;
+use crate::encoding::{ReadError, Reader, Writer};
 use crate::model::Model;
 use crate::slots::{
     BeginError, Boot, Geometry, GeometryError, MarkError, Payload, Release, Slots, VerifyError,
@@ -239,6 +240,40 @@ pub enum Ask {
     },
 }
 
+impl Request {
+    /// As postcard has it, over the one that is there.
+    #[inline(never)]
+    pub(crate) fn read(&mut self, reader: &mut Reader<'_>) -> Result<(), ReadError> {
+        self.number = reader.byte()?;
+        let kind = reader.word()?;
+        if kind > 6 {
+            return Err(ReadError::Unsupported);
+        }
+        // All but Hello and Confirm are of a session.
+        let session = if kind == 0 || kind == 5 { 0 } else { reader.word()? };
+        self.ask = match kind {
+            0 => Ask::Hello,
+            1 => {
+                let release = Release::read(reader)?;
+                Ask::Begin { session, release, signature: Signature::new() }
+            }
+            2 => Ask::Chunk { session, offset: reader.word()?, bytes: Vec::new() },
+            3 => Ask::Verify { session },
+            4 => Ask::Activate { session, signature: Signature::new() },
+            5 => Ask::Confirm { signature: Signature::new() },
+            _ => Ask::Abort { session, signature: Signature::new() },
+        };
+        match &mut self.ask {
+            Ask::Hello | Ask::Verify { .. } => Ok(()),
+            Ask::Chunk { bytes, .. } => reader.list(bytes, Reader::byte),
+            Ask::Begin { signature, .. }
+            | Ask::Activate { signature, .. }
+            | Ask::Confirm { signature }
+            | Ask::Abort { signature, .. } => reader.list(signature, Reader::byte),
+        }
+    }
+}
+
 /// What the controller answers.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Answer {
@@ -246,6 +281,33 @@ pub struct Answer {
     pub number: u8,
     /// What.
     pub say: Say,
+}
+
+impl Answer {
+    /// As postcard writes it.
+    #[inline(never)]
+    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
+        to.byte(self.number);
+        let (kind, number) = match &self.say {
+            Say::Hello(hello) => {
+                to.byte(0);
+                return hello.write(to);
+            }
+            Say::Working { most_ms } => (1, Some(*most_ms)),
+            Say::Begun { written } => (2, Some(*written)),
+            Say::Written { written } => (3, Some(*written)),
+            Say::Verified => (4, None),
+            Say::Activated => (5, None),
+            Say::Confirmed => (6, None),
+            Say::Aborted => (7, None),
+            Say::Refused(refused) => {
+                to.byte(8);
+                return refused.write(to);
+            }
+        };
+        to.byte(kind);
+        number.into_iter().for_each(|number| to.word(number));
+    }
 }
 
 /// The kinds of answers.
@@ -358,6 +420,43 @@ pub enum Refused {
     Flash,
 }
 
+impl Refused {
+    #[inline(never)]
+    fn write<const C: usize>(self, to: &mut Writer<C>) {
+        let (kind, number) = match self {
+            Self::Unknown { variant } => {
+                to.byte(0);
+                return to.byte(variant);
+            }
+            Self::TooLong { most } => (1, Some(most)),
+            Self::Busy => (2, None),
+            Self::Working => (3, None),
+            Self::Signature => (4, None),
+            Self::Pause { ms } => (5, Some(ms)),
+            Self::AnotherRobot { robot } => (6, Some(robot)),
+            Self::BelowFloor { floor } => (7, Some(floor)),
+            Self::Length { room } => (8, Some(room)),
+            Self::OnTrial => (9, None),
+            Self::InUse => (10, None),
+            Self::NoSession => (11, None),
+            Self::OutOfOrder { written } => (12, Some(written)),
+            Self::Incomplete { written } => (13, Some(written)),
+            Self::Hash => (14, None),
+            Self::Model => (15, None),
+            Self::NotVerified => (16, None),
+            Self::NotOnTrial => (17, None),
+            Self::TooEarly { good, needed } => {
+                to.byte(18);
+                to.word(good);
+                return to.word(needed);
+            }
+            Self::Flash => (19, None),
+        };
+        to.byte(kind);
+        number.into_iter().for_each(|number| to.word(number));
+    }
+}
+
 /// Who a controller is.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Hello {
@@ -383,6 +482,37 @@ pub struct Hello {
     pub floor: u32,
     /// The first bytes of the public key that is trusted; `None`: everybody is.
     pub key: Option<[u8; 8]>,
+}
+
+impl Hello {
+    fn write<const C: usize>(&self, to: &mut Writer<C>) {
+        to.byte(self.protocol);
+        to.bytes(self.firmware.as_bytes());
+        to.bytes(self.name.as_bytes());
+        to.word(self.robot);
+        to.byte(self.mode as u8);
+        let Capacities { sample_us, states, inputs, room, instructions, lag, .. } = self.capacities;
+        let Capacities { observables, blocks, factors, terms, sparse_terms, .. } = self.capacities;
+        to.word(sample_us);
+        to.byte(states);
+        to.byte(inputs);
+        to.word(room);
+        to.word(instructions);
+        to.byte(lag);
+        for capacity in [observables, blocks, factors, terms, sparse_terms] {
+            to.word(capacity.into());
+        }
+        to.byte(self.which as u8);
+        self.release.write(to);
+        to.byte(self.trial.is_some().into());
+        if let Some(Trial { good, needed }) = self.trial {
+            to.word(good);
+            to.word(needed);
+        }
+        to.word(self.floor);
+        to.byte(self.key.is_some().into());
+        self.key.iter().for_each(|key| to.array(key));
+    }
 }
 
 /// How a trial goes.

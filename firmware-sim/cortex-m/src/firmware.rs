@@ -210,8 +210,9 @@ fn leg(trust: impl Trust) -> Option<()> {
     serve(&mut leg, trust, identity("soft-leg", &LEG.0, capacities), &mut frames)
 }
 
+#[inline(never)]
 fn serve(
-    robot: &mut impl ControlLoop<2>,
+    robot: &mut dyn ControlLoop<2>,
     trust: impl Trust,
     identity: Identity<'static>,
     frames: &mut firmware_core::control_loop::telemetry::Frames<'_>,

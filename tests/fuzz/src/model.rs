@@ -13,8 +13,7 @@ const STEPS: usize = 6;
 /// What a rollout leaves alone keeps this value, a NaN that no arithmetic makes.
 const UNTOUCHED: u32 = 0x7FED_CBA9;
 
-static OTHER: &Aligned<[u8]> =
-    &Aligned(*include_bytes!("../../../models/soft-leg/model.bin"));
+static OTHER: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/soft-leg/model.bin"));
 
 /// Everything that reads a blob, and that it agrees with itself.
 pub fn read(bytes: &[u8]) {
