@@ -210,9 +210,27 @@ impl Scalar for f32 {
         let root = root * (1.5 - half * root * root);
         root * (1.5 - half * root * root)
     }
+    // A difference at a time, each of them exact. libm's divides integers of 64 bits, which is a kilobyte
+    // of a controller's flash.
     #[inline]
     fn rem(self, divisor: Self) -> Self {
-        libm::fmodf(self, divisor)
+        let (mut rest, divisor) = (self.abs(), divisor.abs());
+        if !(rest.is_finite() && divisor > 0.0) {
+            return f32::NAN;
+        }
+        let mut step = divisor;
+        while step <= rest * 0.5 {
+            step += step;
+        }
+        loop {
+            if rest >= step {
+                rest -= step;
+            }
+            if step <= divisor {
+                return rest.copysign(self);
+            }
+            step *= 0.5;
+        }
     }
     #[inline]
     fn abs(self) -> Self {

@@ -81,8 +81,6 @@
 //! assert_eq!(slots.floor(), 7);
 //! ```
 
-use core::cmp::Reverse;
-
 use embedded_storage::nor_flash::{NorFlash, ReadNorFlash};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -542,6 +540,7 @@ enum State {
 }
 
 impl Record {
+    #[inline(never)]
     fn state(&self) -> State {
         if self.rejected.erased < 2 {
             State::Rejected
@@ -560,6 +559,11 @@ impl Record {
     fn rank(&self) -> (u32, u32) {
         (self.header.sequence, self.header.generation)
     }
+}
+
+/// That of a slot that can be read.
+fn state<E>(record: &Result<Record, E>) -> Option<State> {
+    record.as_ref().ok().map(Record::state)
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -627,44 +631,47 @@ impl<F: NorFlash> Slots<F> {
         let robot = self::robot(robot);
         let (running, trial, update) = (None, false, None);
         let mut slots = Self { flash, geometry, robot, floor: lowest, running, trial, update };
-        let records = Side::BOTH.map(|side| slots.settled(side));
-        let state = |record: &Result<Record, _>| record.as_ref().ok().map(Record::state);
-        for record in records.iter().flatten() {
+        let mut records = Side::BOTH.map(|side| (side, slots.settled(side)));
+        for (_, record) in &records {
             // What another robot's firmware left behind says nothing about this one.
-            if record.state() == State::Confirmed && record.header.robot == robot {
-                slots.floor = slots.floor.max(record.header.sequence);
+            if let Ok(Record { header, .. }) = record
+                && state(record) == Some(State::Confirmed)
+                && header.robot == robot
+            {
+                slots.floor = slots.floor.max(header.sequence);
             }
         }
-
-        let [a, b] = records;
         // Fresh ones before confirmed ones, the newest first.
+        let [a, b] = &records;
         let key = |record: &Result<Record, _>| {
             let generation = record.as_ref().map_or(0, |record| record.header.generation);
-            Reverse((state(record) == Some(State::Fresh), generation))
+            (state(record) == Some(State::Fresh), generation)
         };
-        let mut candidates = [(Side::A, a), (Side::B, b)];
-        candidates.sort_unstable_by_key(|(_, record)| key(record));
+        if key(&b.1) > key(&a.1) {
+            records.reverse();
+        }
 
         let (running, floor, refused) = (Which::Factory, slots.floor, [None, None]);
         let mut boot = Boot { running, payload: None, trial, floor, refused };
-        for (side, record) in candidates {
-            if boot.payload.is_some() && record.is_ok() {
-                continue;
-            }
-            match record.and_then(|record| slots.try_run(side, &record, &mut accept)) {
-                Ok(payload) => {
-                    boot.running = payload.slot;
-                    boot.payload = Some(payload);
-                    boot.trial = slots.trial;
-                }
-                Err(refusal) => {
-                    let [a, b] = &mut boot.refused;
-                    *match side {
-                        Side::A => a,
-                        Side::B => b,
-                    } = Some(refusal);
-                }
-            }
+        for (side, record) in records {
+            let refusal = match record {
+                Ok(_) if boot.payload.is_some() => continue,
+                Ok(record) => match slots.try_run(side, &record, &mut accept) {
+                    Ok(payload) => {
+                        boot.running = payload.slot;
+                        boot.payload = Some(payload);
+                        boot.trial = slots.trial;
+                        continue;
+                    }
+                    Err(refusal) => refusal,
+                },
+                Err(refusal) => refusal,
+            };
+            let [a, b] = &mut boot.refused;
+            *match side {
+                Side::A => a,
+                Side::B => b,
+            } = Some(refusal);
         }
         Ok((slots, boot))
     }
@@ -689,6 +696,7 @@ impl<F: NorFlash> Slots<F> {
     }
 
     /// Checks a slot, marks its trial, and asks the caller.
+    #[inline(never)]
     fn try_run(
         &mut self,
         side: Side,
@@ -803,21 +811,22 @@ impl<F: NorFlash> Slots<F> {
     pub fn begin(&mut self, release: &Release) -> Result<(), BeginError> {
         self.check(release)?;
         let Release { length, sha256, sequence, robot } = *release;
-        // Slots that cannot be read are empty.
-        let [a, b] = Side::BOTH.map(|side| self.record(side).ok());
-        let side = self.running.map_or_else(
-            || {
-                let rank = |record: &Option<Record>| {
-                    record.filter(|record| record.state() == State::Confirmed).map(|r| r.rank())
-                };
-                if rank(&a) <= rank(&b) { Side::A } else { Side::B }
-            },
-            |running| running.side.other(),
-        );
-        let generations = [a, b].into_iter().flatten().map(|record| record.header.generation);
         // That of what runs, even if it cannot be read just now.
-        let known = self.running.map_or(0, |running| running.header.generation);
-        let generation = generations.max().unwrap_or(0).max(known).saturating_add(1);
+        let mut newest = self.running.map_or(0, |running| running.header.generation);
+        let mut ranks = [None; 2];
+        for (rank, side) in ranks.iter_mut().zip(Side::BOTH) {
+            // A slot that cannot be read is empty.
+            let Ok(record) = self.record(side) else { continue };
+            newest = newest.max(record.header.generation);
+            *rank = (record.state() == State::Confirmed).then(|| record.rank());
+        }
+        let generation = newest.saturating_add(1);
+        let [a, b] = ranks;
+        let side = match self.running {
+            Some(running) => running.side.other(),
+            None if a <= b => Side::A,
+            None => Side::B,
+        };
         self.update = Some(Update {
             side,
             header: Header { length, sequence, generation, robot, sha256 },
@@ -1007,6 +1016,7 @@ impl<F: NorFlash> Slots<F> {
         slot.saturating_add(offset)
     }
 
+    #[inline(never)]
     fn record(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
         let mut bytes = [0; HEADER];
         self.flash.read(self.at(side, 0), &mut bytes).map_err(Refusal::Flash)?;

@@ -127,3 +127,19 @@ fn reciprocal_roots() {
     println!("at most {worst:.3e}");
     assert!(worst <= 2.4e-7);
 }
+
+#[test]
+fn remainders_are_those_of_libm() {
+    use std::f32::consts::TAU;
+    // Numbers of every size and sign, zeros, infinities and NaN among them.
+    let all = || (0..=u32::MAX).step_by(104_729).map(f32::from_bits);
+    let mut divisors = vec![TAU, 1.0, f32::MIN_POSITIVE, f32::MAX, f32::INFINITY, 1e-42, 0.0, -3.0];
+    divisors.extend(all().step_by(1_777));
+    for divisor in divisors {
+        for x in all().chain([TAU, -TAU, 2.0 * TAU, 0.0, -0.0, f32::INFINITY, f32::NAN]) {
+            let (found, expected) = (Scalar::rem(x, divisor), libm::fmodf(x, divisor));
+            let same = found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan();
+            assert!(same, "{x:e} and {divisor:e}: {found:e} instead of {expected:e}");
+        }
+    }
+}
