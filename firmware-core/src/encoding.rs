@@ -64,6 +64,13 @@ impl<'a> Reader<'a> {
     /// An integer of so many bits.
     #[inline(never)]
     fn varint(&mut self, bits: u32) -> Result<usize, ReadError> {
+        // A byte, as a rule.
+        if let Some((byte, rest)) = self.rest.split_first()
+            && *byte < 0x80
+        {
+            self.rest = rest;
+            return Ok((*byte).into());
+        }
         let (mut value, mut shift) = (0_usize, 0_u32);
         while shift < bits {
             let byte = self.byte()?;
@@ -82,27 +89,14 @@ impl<'a> Reader<'a> {
         Err(ReadError::Malformed)
     }
 
-    /// An integer that is a byte as a rule.
     #[inline(always)]
     pub(crate) fn word(&mut self) -> Result<u32, ReadError> {
-        match self.rest.split_first() {
-            Some((byte, rest)) if *byte < 0x80 => {
-                self.rest = rest;
-                Ok((*byte).into())
-            }
-            _ => Ok(self.varint(u32::BITS)? as u32),
-        }
+        Ok(self.varint(u32::BITS)? as u32)
     }
 
     #[inline(always)]
     fn length(&mut self) -> Result<usize, ReadError> {
-        match self.rest.split_first() {
-            Some((byte, rest)) if *byte < 0x80 => {
-                self.rest = rest;
-                Ok((*byte).into())
-            }
-            _ => self.varint(usize::BITS),
-        }
+        self.varint(usize::BITS)
     }
 
     /// Bytes behind their length, in place.

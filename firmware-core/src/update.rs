@@ -177,6 +177,9 @@ pub const SIGNATURE_PAUSE_US: u64 = 1_000_000;
 /// Bytes of a signature.
 pub const SIGNATURE: usize = 64;
 
+/// Bytes of a name.
+const NAME: usize = 24;
+
 /// A signature; empty where nothing is signed.
 pub type Signature = Vec<u8, SIGNATURE>;
 
@@ -463,9 +466,9 @@ pub struct Hello {
     /// [`PROTOCOL`].
     pub protocol: u8,
     /// Its firmware and version.
-    pub firmware: String<24>,
+    pub firmware: String<NAME>,
     /// Beginning of the robot's name, as far as there is room.
-    pub name: String<24>,
+    pub name: String<NAME>,
     /// [`robot`] of the whole name.
     pub robot: u32,
     /// What the loop is doing.
@@ -1237,12 +1240,14 @@ where
 }
 
 /// As much of a text as there is room for.
-fn beginning<const C: usize>(text: &str) -> String<C> {
-    let mut beginning = String::new();
-    for character in text.chars() {
-        if beginning.push(character).is_err() {
-            break;
-        }
+#[inline(never)]
+fn beginning(text: &str) -> String<NAME> {
+    let mut end = text.len().min(NAME);
+    while !text.is_char_boundary(end) {
+        end = end.saturating_sub(1);
     }
+    let mut beginning = String::new();
+    // There is room.
+    let _ = beginning.push_str(text.get(..end).unwrap_or(""));
     beginning
 }

@@ -328,6 +328,7 @@ where
     }
 
     /// What a robot that stands still does not carry on.
+    #[inline(never)]
     fn forget(&mut self) {
         for side in &mut self.sides {
             side.integral = 0.0;

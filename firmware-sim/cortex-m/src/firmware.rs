@@ -10,8 +10,7 @@ use embedded_io::{ErrorType as IoErrorType, Read, ReadReady, Write, WriteReady};
 use embedded_storage::nor_flash::{
     ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
-use firmware_core::Model;
-use firmware_core::blob::Aligned;
+use firmware_core::blob::{Aligned, parse_into};
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
 use firmware_core::control_loop::telemetry::Queue;
@@ -20,6 +19,7 @@ use firmware_core::device::{EncoderCount, PositionSensor};
 use firmware_core::link::Port;
 use firmware_core::slots::{Geometry, Payload};
 use firmware_core::update::{Capacities, Identity, Trust, Updater};
+use firmware_core::{Model, PredictorState};
 
 static ROSBOT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/skid-rosbot/model.bin"));
 static LEG: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/soft-leg/model.bin"));
@@ -153,9 +153,16 @@ fn identity(
     Identity { firmware: "image", robot, factory, capacities, erase_ms: 4_000, good_ticks: 1_000 }
 }
 
-/// The model of the ROSbot.
-pub fn rosbot_model() -> Option<Model<'static>> {
-    firmware_core::parse_for("skid-rosbot", &ROSBOT.0).ok()
+/// The model of the ROSbot, where it is to be.
+pub fn rosbot_model(model: &mut Model<'static>) -> Option<()> {
+    load(model, "skid-rosbot", &ROSBOT.0)
+}
+
+/// Loads the model of a robot; the state in which its prediction is tried is off the stack afterwards.
+#[inline(never)]
+fn load(model: &mut Model<'static>, robot: &str, blob: &'static [u8]) -> Option<()> {
+    parse_into(blob, model, &mut PredictorState::new()).ok()?;
+    (model.structure().robot() == robot).then_some(())
 }
 
 /// Its loop.
@@ -171,8 +178,8 @@ pub fn rosbot_loop<'m, 'q>(
 }
 
 /// The model of the leg.
-pub fn leg_model() -> Option<Model<'static>> {
-    firmware_core::parse_for("soft-leg", &LEG.0).ok()
+pub fn leg_model(model: &mut Model<'static>) -> Option<()> {
+    load(model, "soft-leg", &LEG.0)
 }
 
 /// Its loop.
@@ -192,7 +199,8 @@ pub fn leg_loop<'m, 'q>(
 
 #[inline(never)]
 fn rosbot(trust: impl Trust) -> Option<()> {
-    let model = rosbot_model()?;
+    let mut model = Model::empty();
+    rosbot_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut robot = rosbot_loop(&model, Telemetry::new(producer))?;
@@ -202,7 +210,8 @@ fn rosbot(trust: impl Trust) -> Option<()> {
 
 #[inline(never)]
 fn leg(trust: impl Trust) -> Option<()> {
-    let model = leg_model()?;
+    let mut model = Model::empty();
+    leg_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut leg = leg_loop(&model, Telemetry::new(producer))?;
