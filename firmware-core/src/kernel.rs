@@ -41,7 +41,7 @@ use crate::dictionary::{
     Basis, DictionaryError, Factor, Observable, basis_functions, block_size, observable_pair, turn,
 };
 use crate::model::{ModelError, Structure};
-use crate::registers::{Cells, INPUTS, NOWHERE, ONE, Registers};
+use crate::registers::{Cells, INPUTS, Layout, NOWHERE, ONE, Registers};
 use crate::sparse::{SparseError, SparseTerms};
 use crate::{Number, Scalar};
 
@@ -463,7 +463,7 @@ fn byte(register: usize) -> u8 {
 }
 
 /// Functions of a sparse model whose registers are looked up at once while its program is made.
-const TABLE: usize = 32;
+const TABLE: usize = 24;
 
 impl Program {
     /// Of nothing.
@@ -484,6 +484,17 @@ impl Program {
         self.products.clear();
     }
 
+    /// The register of an observable.
+    #[inline(never)]
+    fn observed(&self, layout: &Layout, observable: u8) -> u8 {
+        // They are in order, so that it cannot be further behind.
+        let own = self.scaled.get(..=usize::from(observable)).unwrap_or(&self.scaled);
+        match own.iter().rposition(|[index, _]| *index == observable) {
+            Some(place) => self.first.saturating_add(place as u8),
+            None => layout.observables.get(usize::from(observable)).copied().unwrap_or(NOWHERE),
+        }
+    }
+
     /// Becomes that of a structure and the terms that have been checked against its dictionary. It is
     /// made where it lies: on the stack it would take a kilobyte.
     #[inline(never)]
@@ -494,15 +505,14 @@ impl Program {
     ) -> Result<(), E> {
         let (layout, dictionary) = (structure.layout(), structure.dictionary());
         self.clear();
-        let Self { first, scaled, harmonics, products, powers } = self;
-        *first = layout.end;
+        self.first = layout.end;
         let observables = dictionary.observables().iter().zip(&layout.observables);
         for (index, (o, register)) in observables.enumerate() {
             if terms.is_none() || (o.centre, o.gain) != (0.0, 1.0) {
-                let _ = scaled.push([index as u8, *register]);
+                let _ = self.scaled.push([index as u8, *register]);
             }
         }
-        let mut next = usize::from(*first).saturating_add(scaled.len());
+        let mut next = usize::from(self.first).saturating_add(self.scaled.len());
         let Some(terms) = terms else {
             return if next <= REGISTERS {
                 Ok(())
@@ -513,33 +523,27 @@ impl Program {
             };
         };
         let factors = dictionary.factors();
-        let observed = |observable: u8| {
-            // They are in order, so that it cannot be further behind.
-            let own = scaled.get(..=usize::from(observable)).unwrap_or(scaled);
-            match own.iter().rposition(|[index, _]| *index == observable) {
-                Some(place) => first.saturating_add(place as u8),
-                None => layout.observables.get(usize::from(observable)).copied().unwrap_or(NOWHERE),
-            }
-        };
         let first_harmonic = next;
         for factor in factors.iter().filter(|f| f.basis == Basis::Fourier && f.order > 1) {
-            let (sin, cos) =
-                (observed(factor.observable), observed(factor.observable.saturating_add(1)));
+            let (sin, cos) = (
+                self.observed(layout, factor.observable),
+                self.observed(layout, factor.observable.saturating_add(1)),
+            );
             let order = factor.order;
-            let _ = harmonics.push(Harmonics { sin, cos, order });
+            let _ = self.harmonics.push(Harmonics { sin, cos, order });
             next = next.saturating_add(usize::from(order).saturating_sub(1).saturating_mul(2));
         }
         let first_power = next;
         for factor in factors.iter().filter(|f| f.basis == Basis::Hermite) {
-            let v = observed(factor.observable);
+            let v = self.observed(layout, factor.observable);
             let mut power = v;
             for _ in 1..factor.order {
-                let _ = products.push([power, v]);
+                let _ = self.products.push([power, v]);
                 power = byte(next);
                 next = next.saturating_add(1);
             }
         }
-        *powers = products.len() as u8;
+        self.powers = self.products.len() as u8;
         let first_term = next;
         for [parent, _] in terms.entries() {
             let parent = match parent.checked_sub(1) {
@@ -547,7 +551,7 @@ impl Program {
                 Some(earlier) => byte(first_term.saturating_add(earlier.into())),
             };
             // The register of its function follows.
-            let _ = products.push([parent, NOWHERE]);
+            let _ = self.products.push([parent, NOWHERE]);
             next = next.saturating_add(1);
         }
         if next > REGISTERS {
@@ -565,11 +569,11 @@ impl Program {
             };
             let (mut harmonic, mut power) = (first_harmonic, first_power);
             for factor in factors {
-                put(observed(factor.observable));
+                put(self.observed(layout, factor.observable));
                 let (next, others) = match factor.basis {
                     Basis::Hermite => (&mut power, 2),
                     Basis::Fourier => {
-                        put(observed(factor.observable.saturating_add(1)));
+                        put(self.observed(layout, factor.observable.saturating_add(1)));
                         (&mut harmonic, 3)
                     }
                 };
@@ -578,7 +582,7 @@ impl Program {
                     *next = next.saturating_add(1);
                 }
             }
-            let terms = products.iter_mut().skip((*powers).into()).zip(terms.entries());
+            let terms = self.products.iter_mut().skip(self.powers.into()).zip(terms.entries());
             for ([_, register], [_, function]) in terms {
                 let place = usize::from(*function).checked_sub(from);
                 if let Some(found) = place.and_then(|place| table.get(place)) {

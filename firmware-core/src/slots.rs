@@ -691,6 +691,7 @@ impl<F: NorFlash> Slots<F> {
     }
 
     /// Reads what is before the payload, and decides for good what a cut may have left undecided.
+    #[inline(never)]
     fn settled(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
         let record = self.record(side)?;
         let state = record.state();

@@ -940,6 +940,7 @@ where
     }
 
     /// Whether a session is alive; that of an update that is over is not.
+    #[inline(never)]
     fn settle(&mut self, now_us: u64) {
         if let Some(session) = &mut self.session {
             let heard_us = *session.heard_us.get_or_insert(now_us);
@@ -1171,7 +1172,7 @@ where
         self.settle(now_us);
         let Request { number, ask } = request;
         let answer = |say| Some(Answer { number: *number, say });
-        if *ask == Ask::Hello {
+        if matches!(ask, Ask::Hello) {
             return answer(Say::Hello(self.hello(mode)));
         }
         if mode == Mode::Running {
@@ -1219,7 +1220,7 @@ where
                 }
             },
         };
-        if result == Err(Refused::Flash) {
+        if matches!(result, Err(Refused::Flash)) {
             self.session = None;
         }
         if let Some(session) = &mut self.session {

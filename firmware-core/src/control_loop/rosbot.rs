@@ -223,6 +223,7 @@ where
     /// # Errors
     /// [`ControlLoopError`]: the model is not one of three states and two inputs, or a setting is out of
     /// range.
+    #[inline(always)]
     pub fn new(
         model: &'m Model<'a>,
         (actuators, encoders, sensor): (A, E, S),

@@ -432,9 +432,10 @@ impl Supervisor {
 
     /// A frame with what is known here: mode, alarms, what was noticed and the longest tick since the
     /// frame before.
-    pub fn report(&mut self, frame: Frame) -> Frame {
-        let (worst_tick_us, noticed) = (self.take_worst_us(), self.take_recent());
-        Frame { mode: self.mode, alarms: self.alarms, noticed, worst_tick_us, ..frame }
+    pub fn report(&mut self, mut frame: Frame) -> Frame {
+        (frame.mode, frame.alarms) = (self.mode, self.alarms);
+        (frame.worst_tick_us, frame.noticed) = (self.take_worst_us(), self.take_recent());
+        frame
     }
 
     /// The longest tick since the last call (µs).

@@ -90,8 +90,9 @@ impl<'q> Telemetry<'q> {
 
     /// Numbers a frame, as [`Supervisor::report`](crate::control_loop::Supervisor::report) made it, and
     /// puts it into the queue; drops it when the queue is full.
-    pub fn send(&mut self, frame: Frame) {
-        let frame = Frame { sequence: self.sequence, dropped: self.dropped, ..frame };
+    #[inline(never)]
+    pub fn send(&mut self, mut frame: Frame) {
+        (frame.sequence, frame.dropped) = (self.sequence, self.dropped);
         self.sequence = self.sequence.wrapping_add(1);
         if self.queue.enqueue(frame).is_err() {
             self.dropped = self.dropped.saturating_add(1);

@@ -79,6 +79,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
     ///
     /// # Errors
     /// [`ControlLoopError::DimensionMismatch`].
+    #[inline(always)]
     pub fn new(model: &'m Model<'a>, blind_samples: u32) -> Result<Self, ControlLoopError> {
         let structure = model.structure();
         for (field, expected, found) in
@@ -223,6 +224,7 @@ struct Beside<'m, 'a> {
 }
 
 impl<'m, 'a> Beside<'m, 'a> {
+    #[inline(always)]
     fn new(model: &'m Model<'a>, blind_samples: u32) -> Self {
         let lag = model.structure().lag();
         let reach = model.error_bounds().and_then(|bounds| bounds.horizons().last().copied());

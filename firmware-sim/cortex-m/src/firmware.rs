@@ -153,6 +153,11 @@ fn identity(
     Identity { firmware: "image", robot, factory, capacities, erase_ms: 4_000, good_ticks: 1_000 }
 }
 
+#[inline(never)]
+fn no_model() -> Model<'static> {
+    Model::empty()
+}
+
 /// The model of the ROSbot, where it is to be.
 pub fn rosbot_model(model: &mut Model<'static>) -> Option<()> {
     load(model, "skid-rosbot", &ROSBOT.0)
@@ -199,7 +204,7 @@ pub fn leg_loop<'m, 'q>(
 
 #[inline(never)]
 fn rosbot(trust: impl Trust) -> Option<()> {
-    let mut model = Model::empty();
+    let mut model = no_model();
     rosbot_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
@@ -210,7 +215,7 @@ fn rosbot(trust: impl Trust) -> Option<()> {
 
 #[inline(never)]
 fn leg(trust: impl Trust) -> Option<()> {
-    let mut model = Model::empty();
+    let mut model = no_model();
     leg_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
