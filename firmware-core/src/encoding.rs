@@ -144,6 +144,11 @@ impl<const N: usize> Writer<N> {
         self.bytes.get(..self.length)
     }
 
+    /// The whole room; zeros where nothing was written.
+    pub(crate) fn all(&self) -> [u8; N] {
+        self.bytes
+    }
+
     #[inline(never)]
     pub(crate) fn byte(&mut self, byte: u8) {
         if let Some(place) = self.bytes.get_mut(self.length) {

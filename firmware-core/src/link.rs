@@ -456,7 +456,7 @@ fn take<const M: usize>(
             robot.command(command);
             Ok(None)
         }
-        Incoming::Request => Ok(updates.receive(&request, robot.mode(), now_us)),
+        Incoming::Request => Ok(updates.receive(request, robot.mode(), now_us)),
         Incoming::ForHost => Err(None),
         Incoming::Unknown { variant, number } => Err(refused(number, Refused::Unknown { variant })),
     }

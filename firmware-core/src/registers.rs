@@ -165,7 +165,7 @@ pub(crate) struct Place {
 
 impl Place {
     /// Of coordinate `i`: whether its changes are observed, and its sine and cosine needed.
-    #[inline(never)]
+    #[inline(always)]
     fn of(
         i: u8,
         state: &State<'_>,

@@ -761,6 +761,7 @@ impl<F: NorFlash> Slots<F> {
     }
 
     /// The update that is under way.
+    #[inline(never)]
     pub fn update(&self) -> Option<Release> {
         self.update.as_ref().map(|update| update.header.release())
     }

@@ -673,19 +673,14 @@ impl Purpose {
 /// ```
 pub fn statement(purpose: Purpose, release: &Release) -> [u8; 64] {
     let Release { length, sha256, sequence, robot } = release;
-    let mut bytes = [0; 64];
-    let fields: [&[u8]; 6] = [
-        b"koopman-release\0",
-        &[purpose as u8, 0, 0, 0],
-        &robot.to_le_bytes(),
-        &sequence.to_le_bytes(),
-        &length.to_le_bytes(),
-        sha256,
-    ];
-    for (place, byte) in bytes.iter_mut().zip(fields.into_iter().flatten()) {
-        *place = *byte;
+    let mut statement = Writer::<64>::new();
+    statement.array(b"koopman-release\0");
+    statement.array(&[purpose as u8, 0, 0, 0]);
+    for number in [robot, sequence, length] {
+        statement.array(&number.to_le_bytes());
     }
-    bytes
+    statement.array(sha256);
+    statement.all()
 }
 
 /// Whose releases are installed.
@@ -757,7 +752,7 @@ pub struct Identity<'r> {
 /// Takes requests, as a [`Port`](crate::link::Port) hands them on.
 pub trait Updates {
     /// A request has arrived; what can be answered at once.
-    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer>;
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer>;
 
     /// Whether there is something to do that takes long: only while the robot is at rest.
     fn is_working(&self) -> bool;
@@ -776,7 +771,7 @@ pub trait Updates {
 pub struct NoUpdates;
 
 impl Updates for NoUpdates {
-    fn receive(&mut self, request: &Request, _: Mode, _: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, _: Mode, _: u64) -> Option<Answer> {
         let unknown = Refused::Unknown { variant: crate::link::REQUEST };
         Some(Answer { number: request.number, say: Say::Refused(unknown) })
     }
@@ -795,7 +790,7 @@ impl Updates for NoUpdates {
 }
 
 impl<U: Updates> Updates for Option<U> {
-    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
         match self {
             Some(updates) => updates.receive(request, mode, now_us),
             None => NoUpdates.receive(request, mode, now_us),
@@ -1168,10 +1163,11 @@ where
     T: Trust,
     A: FnMut(Payload) -> bool,
 {
-    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
         self.settle(now_us);
-        let Request { number, ask } = request;
-        let answer = |say| Some(Answer { number: *number, say });
+        let Request { number, ask } = &request;
+        let number = *number;
+        let answer = |say| Some(Answer { number, say });
         if matches!(ask, Ask::Hello) {
             return answer(Say::Hello(self.hello(mode)));
         }
@@ -1180,15 +1176,15 @@ where
         }
         match &self.job {
             // It is on its way.
-            Some(Job::Ask(Request { number: known, .. })) if known == number => return None,
-            Some(Job::Erase(known)) if known == number => return answer(self.working()),
+            Some(Job::Ask(Request { number: known, .. })) if *known == number => return None,
+            Some(Job::Erase(known)) if *known == number => return answer(self.working()),
             Some(_) => return answer(Say::Refused(Refused::Working)),
             None => {}
         }
         match self.at_once(ask, now_us) {
             Ok(Some(say)) => answer(say),
             Ok(None) => {
-                self.job = Some(Job::Ask(request.clone()));
+                self.job = Some(Job::Ask(request));
                 None
             }
             Err(refused) => answer(Say::Refused(refused)),

@@ -978,7 +978,7 @@ impl<'m> Controller<'m> {
 
     fn receive(&mut self, number: u8, ask: &Ask) -> Option<Say> {
         let request = Request { number, ask: ask.clone() };
-        let answer = self.updater.receive(&request, self.mode, self.now_us)?;
+        let answer = self.updater.receive(request, self.mode, self.now_us)?;
         assert_eq!(answer.number, number);
         Some(answer.say)
     }
