@@ -87,7 +87,7 @@ const RANGES: (u16, u16) = (0x8001, 3);
 const ERROR_BOUNDS: (u16, u16) = (0x8002, 5);
 
 /// What a byte does to the CRC-32 (ISO-HDLC: polynomial 0x04C11DB7, reflected).
-const BYTES: [u32; 256] = {
+static BYTES: [u32; 256] = {
     let mut bytes = [0; 256];
     let mut rest: &mut [u32] = &mut bytes;
     let mut byte = 0;

@@ -339,6 +339,7 @@ impl Port {
     /// updates; of what these have to do for long, a part, once the robot is
     /// [switched off](crate::control_loop::Supervisor::is_switched_off). Between two ticks of a robot at
     /// rest it may be called as often as there is time.
+    #[inline(never)]
     pub fn receive<const M: usize>(
         &mut self,
         serial: &mut (impl Read + ReadReady),
@@ -402,6 +403,7 @@ impl Port {
 
     /// Sends as much of the waiting answers and frames as the line takes now: the rest of the one on the
     /// way, and at most one more.
+    #[inline(never)]
     pub fn send(&mut self, frames: &mut Frames<'_>, serial: &mut (impl Write + WriteReady)) {
         for _ in 0..2 {
             if self.sent == self.length {

@@ -634,6 +634,7 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`GeometryError`] for slots that there cannot be on this flash.
+    #[inline(always)]
     pub fn boot(
         flash: F,
         geometry: Geometry,

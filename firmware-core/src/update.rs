@@ -701,6 +701,7 @@ impl Trust for PublicKey {
         self.0.first_chunk().copied()
     }
 
+    #[inline(never)]
     fn accepts(&self, statement: &[u8; 64], signature: &[u8]) -> bool {
         let Ok(signature) = <[u8; SIGNATURE]>::try_from(signature) else { return false };
         let signature = ed25519_compact::Signature::new(signature);
@@ -861,6 +862,7 @@ where
     ///
     /// # Errors
     /// [`GeometryError`].
+    #[inline(always)]
     pub fn boot(
         flash: F,
         geometry: Geometry,
@@ -1163,6 +1165,7 @@ where
     T: Trust,
     A: FnMut(Payload) -> bool,
 {
+    #[inline(never)]
     fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
         self.settle(now_us);
         let Request { number, ask } = &request;
@@ -1195,6 +1198,7 @@ where
         self.job.is_some()
     }
 
+    #[inline(never)]
     fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer> {
         self.settle(now_us);
         let (number, result) = match self.job.take()? {

@@ -231,14 +231,12 @@ impl<'m, 'a> Beside<'m, 'a> {
         let monitor = model.error_bounds().map_or_else(Monitor::default, Monitor::new);
         let blind_limit = reach.map_or(blind_samples, |reach| reach.min(blind_samples));
         let fills = u32::try_from(lag).unwrap_or(u32::MAX).saturating_add(1);
+        let shadow_steps = reach.map_or(SHADOW, |reach| reach.min(SHADOW));
         Self {
             predictor: Predictor::new(model),
-            state: PredictorState::new(),
-            trial: PredictorState::new(),
             monitor,
-            shadow: PredictorState::new(),
             slow: monitor,
-            shadow_steps: reach.map_or(SHADOW, |reach| reach.min(SHADOW)),
+            shadow_steps,
             blind: 0,
             blind_limit,
             unpredicted: 0,
@@ -248,6 +246,10 @@ impl<'m, 'a> Beside<'m, 'a> {
             looks_at: u32::MAX >> (31 - lag.min(31)),
             bad: 0,
             outliers: 0,
+            // Last: what is a kilobyte each is then made in its place.
+            state: PredictorState::new(),
+            trial: PredictorState::new(),
+            shadow: PredictorState::new(),
         }
     }
 

@@ -141,8 +141,9 @@ impl NorFlash for Nowhere {
 }
 
 /// One of two robots; never comes back.
-pub fn run(trust: impl Trust + Copy) -> Option<()> {
-    if black_box(true) { rosbot(trust) } else { leg(trust) }
+pub fn run(trust: impl Trust) -> Option<()> {
+    let goes_on = || true;
+    if black_box(true) { rosbot(trust, Nowhere, goes_on) } else { leg(trust, Nowhere, goes_on) }
 }
 
 fn identity(
@@ -202,26 +203,38 @@ pub fn leg_loop<'m, 'q>(
     SoftLeg::<_, _, 20>::new(model, pneumatics, Nowhere, settings, telemetry).ok()
 }
 
+/// The ROSbot as long as it `goes_on`, asked at every tick.
 #[inline(never)]
-fn rosbot(trust: impl Trust) -> Option<()> {
+pub fn rosbot<S: Read + ReadReady + Write + WriteReady>(
+    trust: impl Trust,
+    serial: S,
+    goes_on: impl FnMut() -> bool,
+) -> Option<()> {
     let mut model = no_model();
     rosbot_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut robot = rosbot_loop(&model, Telemetry::new(producer))?;
     let capacities = Capacities::new::<3, 2>(100_000, 0);
-    serve(&mut robot, trust, identity("skid-rosbot", &ROSBOT.0, capacities), &mut frames)
+    let identity = identity("skid-rosbot", &ROSBOT.0, capacities);
+    serve(&mut robot, trust, identity, &mut frames, serial, goes_on)
 }
 
+/// The leg.
 #[inline(never)]
-fn leg(trust: impl Trust) -> Option<()> {
+pub fn leg<S: Read + ReadReady + Write + WriteReady>(
+    trust: impl Trust,
+    serial: S,
+    goes_on: impl FnMut() -> bool,
+) -> Option<()> {
     let mut model = no_model();
     leg_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut leg = leg_loop(&model, Telemetry::new(producer))?;
     let capacities = Capacities::new::<2, 2>(50_000, 0);
-    serve(&mut leg, trust, identity("soft-leg", &LEG.0, capacities), &mut frames)
+    let identity = identity("soft-leg", &LEG.0, capacities);
+    serve(&mut leg, trust, identity, &mut frames, serial, goes_on)
 }
 
 #[inline(never)]
@@ -230,14 +243,15 @@ fn serve(
     trust: impl Trust,
     identity: Identity<'static>,
     frames: &mut firmware_core::control_loop::telemetry::Frames<'_>,
+    mut serial: impl Read + ReadReady + Write + WriteReady,
+    mut goes_on: impl FnMut() -> bool,
 ) -> Option<()> {
     let geometry = Geometry { offset: 0, slot_bytes: 128 * 1024 };
     let accept = |payload: Payload| black_box(payload.length) > 0;
     let booted = Updater::boot(Nowhere, geometry, identity, 0, trust, accept);
     let (mut updater, _) = booted.ok()?;
     let mut port = Port::new();
-    let mut serial = Nowhere;
-    while !(updater.resets() && port.is_sent()) {
+    while goes_on() && !(updater.resets() && port.is_sent()) {
         let now_us = black_box(0);
         port.receive(&mut serial, robot, &mut updater, now_us);
         robot.tick(now_us);
