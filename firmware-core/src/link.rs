@@ -354,19 +354,18 @@ impl Port {
         };
         for byte in bytes.iter().take(count) {
             let Some(body) = self.receiver.complete(*byte) else { continue };
-            let taken = match body {
+            let (is_done, answer) = match body {
                 Ok(body) => take(body, robot, updates, now_us),
                 Err(Unframed::TooLong) => {
                     let most = u32::try_from(MAX_FRAME).unwrap_or(u32::MAX);
-                    Err(refused(0, Refused::TooLong { most }))
+                    (false, refused(0, Refused::TooLong { most }))
                 }
                 // Whoever sent it will see that nothing comes back.
-                Err(Unframed::Damaged) => Err(None),
+                Err(Unframed::Damaged) => (false, None),
             };
-            if taken.is_err() {
+            if !is_done {
                 self.damaged = self.damaged.saturating_add(1);
             }
-            let (Ok(answer) | Err(answer)) = taken;
             self.answer(answer);
         }
         if !updates.is_working() {
@@ -444,23 +443,25 @@ fn refused(number: u8, refused: Refused) -> Option<Answer> {
     Some(Answer { number, say: Say::Refused(refused) })
 }
 
-/// Does what was received; the answer, as an error where nothing could be done.
+/// Does what was received: whether it could be done, and the answer.
 #[inline(never)]
 fn take<const M: usize>(
     body: &[u8],
     robot: &mut (impl ControlLoop<M> + ?Sized),
     updates: &mut impl Updates,
     now_us: u64,
-) -> Result<Option<Answer>, Option<Answer>> {
+) -> (bool, Option<Answer>) {
     let mut request = Request { number: 0, ask: Ask::Hello };
     match Incoming::read(body, &mut request) {
         Incoming::Command(command) => {
             robot.command(command);
-            Ok(None)
+            (true, None)
         }
-        Incoming::Request => Ok(updates.receive(request, robot.mode(), now_us)),
-        Incoming::ForHost => Err(None),
-        Incoming::Unknown { variant, number } => Err(refused(number, Refused::Unknown { variant })),
+        Incoming::Request => (true, updates.receive(request, robot.mode(), now_us)),
+        Incoming::ForHost => (false, None),
+        Incoming::Unknown { variant, number } => {
+            (false, refused(number, Refused::Unknown { variant }))
+        }
     }
 }
 
