@@ -24,9 +24,9 @@
 //! |---|---|---|---|
 //! | 0x0001 | metadata: [`ModelRepr`] | 1: postcard 1 | required |
 //! | 0x0002 | coefficients `[outputs, dense_terms]`, of a sparse model `[outputs, T + 1]` | 2: f32, powers of the observables | required |
-//! | 0x0003 | self-test, below | 3: f32 | required |
+//! | 0x0003 | self-test, below; of a model in fixed point as [`q31`](crate::q31) says | 3: f32; 7: i32 | required |
 //! | 0x0004 | terms of a sparse model, below: `[T, 2]` | 4: u8 | makes the model sparse |
-//! | 0x0005 | coefficients in Q31 | | reserved |
+//! | 0x0005 | scales, ranges and coefficients of a model in fixed point: [`q31`](crate::q31) | 6: 32-bit words | instead of 0x0002 |
 //! | 0x8001 | trained ranges `[observables, 2]`: smallest, largest raw value | 3: f32 | optional |
 //! | 0x8002 | error bounds, below | 5: u32 and f32 | optional |
 //! | 0x8003 | signature | | reserved |
@@ -35,6 +35,9 @@
 //! `[L + 1, states]`; the inputs at the same samples, shape `[L + 1, inputs]`; the expected
 //! coordinates at k + 1 and the tolerance of each, shape `[states]` both. The model is refused
 //! unless it predicts within the tolerance, a finite one (angles compared on the circle).
+//!
+//! A blob in fixed point has the sections 0x0001, 0x0003 and 0x0005 and is read by
+//! [`q31::parse`](crate::q31::parse); [`parse`] refuses it as [`ParseError::FixedPoint`].
 //!
 //! A blob without terms is a dense model: every term of every block of the metadata has its
 //! coefficients. In one with terms ([`sparse`](crate::sparse)) every block is a single factor, not
@@ -80,10 +83,13 @@ const HEADER: usize = 16;
 const ENTRY: usize = 12;
 /// Kinds from here on may be skipped.
 const OPTIONAL: u16 = 0x8000;
-const METADATA: (u16, u16) = (0x0001, 1);
+pub(crate) const METADATA: (u16, u16) = (0x0001, 1);
 const COEFFICIENTS: (u16, u16) = (0x0002, 2);
+pub(crate) const COEFFICIENTS_KIND: u16 = COEFFICIENTS.0;
 const SELF_TEST: (u16, u16) = (0x0003, 3);
 const TERMS: (u16, u16) = (0x0004, 4);
+pub(crate) const Q31: (u16, u16) = (0x0005, 6);
+pub(crate) const Q31_SELF_TEST: (u16, u16) = (0x0003, 7);
 const RANGES: (u16, u16) = (0x8001, 3);
 const ERROR_BOUNDS: (u16, u16) = (0x8002, 5);
 
@@ -136,6 +142,8 @@ pub enum ParseError {
     },
     /// The section table does not hold together.
     SectionTable,
+    /// It is a model in fixed point: [`q31::parse`](crate::q31::parse) reads it.
+    FixedPoint,
     /// A section that has to be understood is not known to this code.
     UnknownSection {
         /// Its kind.
@@ -290,6 +298,15 @@ pub fn parse_for<'a>(robot: &str, bytes: &'a [u8]) -> Result<Model<'a>, ParseErr
 /// # Errors
 /// As [`parse`].
 pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
+    let (blob, _) = checked(slot)?;
+    match Sections::new(blob) {
+        Ok(sections) => read_model(&sections),
+        Err(error) => Err(error),
+    }
+}
+
+/// The blob at the beginning of a slot, and its checksum, which holds.
+pub(crate) fn checked(slot: &[u8]) -> Result<(&[u8], u32), ParseError> {
     if !slot.as_ptr().addr().is_multiple_of(4) {
         return Err(ParseError::Misaligned);
     }
@@ -300,10 +317,7 @@ pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
     if expected != found {
         return Err(ParseError::Checksum { expected, found });
     }
-    match Sections::new(blob) {
-        Ok(sections) => read_model(&sections),
-        Err(error) => Err(error),
-    }
+    Ok((blob, found))
 }
 
 // A model is kilobytes, and so are the parts that it is made of. Below, every part is made in a frame of
@@ -326,7 +340,7 @@ fn read_model<'a>(sections: &Sections<'a>) -> Result<Model<'a>, ParseError> {
 
 /// The metadata, checked.
 #[inline(never)]
-fn read_structure<'a>(sections: &Sections<'a>) -> Result<Structure<'a>, ParseError> {
+pub(crate) fn read_structure<'a>(sections: &Sections<'a>) -> Result<Structure<'a>, ParseError> {
     let mut reader = postcard::Deserializer::from_bytes(sections.bytes(METADATA)?);
     match read_metadata(&mut reader) {
         Ok(repr) => match reader.finalize() {
@@ -433,13 +447,18 @@ fn read_u32(bytes: &[u8], offset: usize) -> u32 {
 }
 
 /// The section table of a blob whose checksum holds, checked.
-struct Sections<'a> {
+pub(crate) struct Sections<'a> {
     blob: &'a [u8],
     table: &'a [[u8; ENTRY]],
 }
 
 impl<'a> Sections<'a> {
     fn new(blob: &'a [u8]) -> Result<Self, ParseError> {
+        Self::of(blob, &[METADATA, COEFFICIENTS, SELF_TEST, TERMS])
+    }
+
+    /// Of a reader that understands these kinds in these encodings.
+    pub(crate) fn of(blob: &'a [u8], known: &[(u16, u16)]) -> Result<Self, ParseError> {
         let bad = ParseError::SectionTable;
         let count = usize::from(read_u16(blob, 6));
         if count > MAX_SECTIONS {
@@ -453,9 +472,12 @@ impl<'a> Sections<'a> {
             if kinds().take(i).any(|earlier| earlier == kind) {
                 return Err(bad);
             }
-            let known = [METADATA, COEFFICIENTS, SELF_TEST, TERMS].contains(&(kind, encoding));
-            if kind < OPTIONAL && !known {
-                return Err(ParseError::UnknownSection { kind, encoding });
+            if kind < OPTIONAL && !known.contains(&(kind, encoding)) {
+                let fixed_point = kinds().any(|kind| kind == Q31.0) && known.contains(&COEFFICIENTS);
+                return Err(match fixed_point {
+                    true => ParseError::FixedPoint,
+                    false => ParseError::UnknownSection { kind, encoding },
+                });
             }
             // Every byte of a blob belongs to one section or is padding of zeros.
             let (offset, length) = (read_u32(entry, 4), read_u32(entry, 8));
@@ -471,7 +493,7 @@ impl<'a> Sections<'a> {
     }
 
     /// The bytes of a section; one of another encoding counts as missing.
-    fn bytes(&self, section: (u16, u16)) -> Result<&'a [u8], ParseError> {
+    pub(crate) fn bytes(&self, section: (u16, u16)) -> Result<&'a [u8], ParseError> {
         let missing = ParseError::MissingSection { kind: section.0 };
         let mut table = self.table.iter();
         let entry = table.find(|e| (read_u16(*e, 0), read_u16(*e, 2)) == section).ok_or(missing)?;
@@ -493,7 +515,7 @@ impl<'a> Sections<'a> {
     }
 
     /// The bytes of a section as whole elements, in place.
-    fn cast<T: bytemuck::AnyBitPattern>(&self, section: (u16, u16)) -> Result<&'a [T], ParseError> {
+    pub(crate) fn cast<T: bytemuck::AnyBitPattern>(&self, section: (u16, u16)) -> Result<&'a [T], ParseError> {
         let bytes = self.bytes(section)?;
         bytemuck::try_cast_slice(bytes).map_err(|_| ParseError::SectionLength {
             kind: section.0,
@@ -561,12 +583,7 @@ pub fn emit(
     let optional =
         [model.terms().is_some(), model.ranges().is_some(), model.error_bounds().is_some()];
     let count = optional.into_iter().fold(3_usize, |n, there| n.saturating_add(there.into()));
-    let table = HEADER.saturating_add(count.saturating_mul(ENTRY));
-    let mut writer = Writer { out, entry: HEADER, end: table };
-    let repr = structure.to_repr();
-    let metadata = writer.out.get_mut(table..).ok_or(short)?;
-    let length = postcard::to_slice(&repr, metadata).map_err(|_| short)?.len();
-    writer.close(METADATA, length).ok_or(short)?;
+    let mut writer = Writer::new(out, count, structure)?;
     writer.numbers(COEFFICIENTS, &[model.coefficients()]).ok_or(short)?;
     writer.numbers(SELF_TEST, &self_test).ok_or(short)?;
     if let Some(terms) = model.terms() {
@@ -583,16 +600,7 @@ pub fn emit(
         let words = words.chain(bounds.bounds().iter().map(|bound| bound.to_bits()));
         writer.words(ERROR_BOUNDS, words.map(u32::to_le_bytes)).ok_or(short)?;
     }
-    let end = writer.end;
-    let blob = out.get_mut(..end).ok_or(short)?;
-    let length = u32::try_from(end).map_err(|_| short)?;
-    write(blob, 0, &MAGIC);
-    write(blob, 4, &VERSION.to_le_bytes());
-    write(blob, 6, &(count as u16).to_le_bytes());
-    write(blob, 8, &length.to_le_bytes());
-    let checksum = checksum(blob);
-    write(blob, 12, &checksum.to_le_bytes());
-    Ok(end)
+    writer.seal()
 }
 
 /// The length in bytes of the blob that [`emit`] writes for a model of this structure, dense or with
@@ -621,13 +629,54 @@ pub fn size(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>, ranges: b
 }
 
 /// Lays sections one after the other and fills in the table.
-struct Writer<'a> {
+pub(crate) struct Writer<'a> {
     out: &'a mut [u8],
     entry: usize,
     end: usize,
 }
 
-impl Writer<'_> {
+impl<'a> Writer<'a> {
+    /// Begins a blob of so many sections with the metadata.
+    pub(crate) fn new(
+        out: &'a mut [u8],
+        sections: usize,
+        structure: &Structure<'_>,
+    ) -> Result<Self, EmitError> {
+        let short = EmitError::BufferTooShort { found: out.len() };
+        let table = HEADER.saturating_add(sections.saturating_mul(ENTRY));
+        let mut writer = Self { out, entry: HEADER, end: table };
+        let metadata = writer.out.get_mut(table..).ok_or(short)?;
+        let length = postcard::to_slice(&structure.to_repr(), metadata).map_err(|_| short)?.len();
+        writer.close(METADATA, length).ok_or(short)?;
+        Ok(writer)
+    }
+
+    /// A section of words.
+    pub(crate) fn put(
+        &mut self,
+        section: (u16, u16),
+        words: impl Iterator<Item = [u8; 4]>,
+    ) -> Result<(), EmitError> {
+        let short = EmitError::BufferTooShort { found: self.out.len() };
+        self.words(section, words).ok_or(short)
+    }
+
+    /// Ends the blob, whose sections are all there: its length.
+    pub(crate) fn seal(self) -> Result<usize, EmitError> {
+        let short = EmitError::BufferTooShort { found: self.out.len() };
+        let blob = self.out.get_mut(..self.end).ok_or(short)?;
+        let length = u32::try_from(self.end).map_err(|_| short)?;
+        // At most MAX_SECTIONS.
+        let count = self.entry.saturating_sub(HEADER).checked_div(ENTRY).unwrap_or(0) as u16;
+        write(blob, 0, &MAGIC);
+        write(blob, 4, &VERSION.to_le_bytes());
+        write(blob, 6, &count.to_le_bytes());
+        write(blob, 8, &length.to_le_bytes());
+        let checksum = checksum(blob);
+        write(blob, 12, &checksum.to_le_bytes());
+        Ok(self.end)
+    }
+
     /// Ends the section of `length` bytes that was written at `end`: table entry and padding.
     fn close(&mut self, (kind, encoding): (u16, u16), length: usize) -> Option<()> {
         let padded = self.end.checked_add(length)?.checked_next_multiple_of(4)?;

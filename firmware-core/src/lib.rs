@@ -34,6 +34,7 @@
 //! | [`history`] | samples: from coordinates to observables, from outputs back to coordinates |
 //! | [`blob`] | the bytes of a model: layout, parse, emit |
 //! | [`predictor`] | `Predictor` (immutable) and `PredictorState`: step, rollout, held inputs |
+//! | [`q31`] | models in fixed point, for controllers without a floating-point unit |
 //! | `registers`, `kernel` (private) | where the numbers of a step lie, and how it computes them |
 //! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
 //! | [`slots`] | two flash slots for models: write, trial, confirm, revert |
@@ -54,6 +55,9 @@
     )
 )]
 
+// Only assembly needs it, which no other machine has.
+#![cfg_attr(not(q31_kernel), forbid(unsafe_code))]
+
 #[cfg(target_endian = "big")]
 compile_error!("blobs are little-endian and are read in place");
 
@@ -69,6 +73,7 @@ mod kernel;
 pub mod link;
 pub mod model;
 pub mod predictor;
+pub mod q31;
 mod registers;
 mod scalar;
 pub mod slots;

@@ -1,0 +1,158 @@
+//! The tiles in assembly, for machines with multiply instructions that have the upper word of a product:
+//! the compiler orders loads and products so that twice as many registers are needed as there are.
+//!
+//! In all functions r0 is behind the coefficients that are not folded yet, r1 behind the results that are
+//! not there yet, and r2 the place of the first result: from the last one to the first. Observables
+//! stay in r3 to r6, the fastest last, and numbers on the way are in r7 to r12; lr is scratch.
+#![allow(unsafe_code, reason = "functions in assembly, and the calls with pointers and lengths checked")]
+
+use core::arch::naked_asm;
+
+/// `lo + ⌊v · hi / 2³²⌋` in `lo`; destroys `hi` and lr.
+#[cfg(q31_kernel = "smmla")]
+macro_rules! fold {
+    ($lo:literal, $v:literal, $hi:literal) => {
+        concat!("smmla ", $lo, ", ", $v, ", ", $hi, ", ", $lo, "\n")
+    };
+}
+#[cfg(q31_kernel = "smull")]
+macro_rules! fold {
+    ($lo:literal, $v:literal, $hi:literal) => {
+        concat!("smull ", $hi, ", lr, ", $v, ", ", $hi, "\nadd ", $lo, ", ", $lo, ", lr\n")
+    };
+}
+
+/// Two axes of two: the four numbers before r0, in ascending registers, to the first of them.
+macro_rules! quad {
+    ($a:literal, $b:literal, $c:literal, $d:literal) => {
+        concat!(
+            "ldmdb r0!, {{", $a, ", ", $b, ", ", $c, ", ", $d, "}}\n",
+            fold!($a, "r6", $b),
+            fold!($c, "r6", $d),
+            fold!($a, "r5", $c),
+        )
+    };
+}
+
+/// Four axes of two: the sixteen numbers before r0 to r7.
+macro_rules! sixteen {
+    () => {
+        concat!(
+            quad!("r7", "r8", "r9", "r10"),
+            quad!("r8", "r9", "r10", "r11"),
+            fold!("r8", "r4", "r7"),
+            quad!("r9", "r10", "r11", "r12"),
+            quad!("r7", "r10", "r11", "r12"),
+            fold!("r7", "r4", "r9"),
+            fold!("r7", "r3", "r8"),
+        )
+    };
+}
+
+/// An axis of four: the four numbers before r0, in ascending registers, to the first of them.
+macro_rules! four {
+    ($a:literal, $b:literal, $c:literal, $d:literal) => {
+        concat!(
+            "ldmdb r0!, {{", $a, ", ", $b, ", ", $c, ", ", $d, "}}\n",
+            fold!($c, "r6", $d),
+            fold!($b, "r6", $c),
+            fold!($a, "r6", $b),
+        )
+    };
+}
+
+/// A result, r7, is put in its place; on with the next one.
+macro_rules! next {
+    () => {
+        "str r7, [r1, #-4]!\ncmp r1, r2\nbne 2b\n"
+    };
+}
+
+/// Six axes of two.
+pub(super) fn six(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
+    #[unsafe(naked)]
+    unsafe extern "C" fn all(_: *const i32, _: *mut i32, _: *mut i32, _: &[i32; 6]) {
+        naked_asm!(concat!(
+            "push {{r4, r5, r6, r7, r8, r9, r10, r11, lr}}\n",
+            "sub sp, #16\n",
+            // On the stack: the second observable and what it is multiplied with, the same for the first.
+            "ldrd r4, r5, [r3]\n",
+            "str r4, [sp, #8]\n",
+            "str r5, [sp]\n",
+            "adds r3, #8\n",
+            "ldm r3, {{r3, r4, r5, r6}}\n",
+            "2:\n",
+            sixteen!(),
+            "str r7, [sp, #4]\n",
+            sixteen!(),
+            "ldrd r8, r9, [sp]\n",
+            fold!("r7", "r8", "r9"),
+            "str r7, [sp, #12]\n",
+            sixteen!(),
+            "str r7, [sp, #4]\n",
+            sixteen!(),
+            "ldrd r8, r9, [sp]\n",
+            fold!("r7", "r8", "r9"),
+            "ldrd r8, r9, [sp, #8]\n",
+            fold!("r7", "r8", "r9"),
+            next!(),
+            "add sp, #16\n",
+            "pop {{r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
+        ))
+    }
+    let Some(v) = v.last_chunk() else { return };
+    if coefficients.len() == out.len().wrapping_mul(64) && !out.is_empty() {
+        let (from, to) = (coefficients.as_ptr_range(), out.as_mut_ptr_range());
+        // SAFETY: reads 64 numbers before `from.end` for every number before `to.end` that it writes,
+        // until the first one is written; there is at least one.
+        unsafe { all(from.end, to.end, to.start, v) }
+    }
+}
+
+/// Four axes of two.
+pub(super) fn four(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
+    #[unsafe(naked)]
+    unsafe extern "C" fn all(_: *const i32, _: *mut i32, _: *mut i32, _: &[i32; 4]) {
+        naked_asm!(concat!(
+            "push {{r4, r5, r6, r7, r8, r9, r10, r11, lr}}\n",
+            "ldm r3, {{r3, r4, r5, r6}}\n",
+            "2:\n",
+            sixteen!(),
+            next!(),
+            "pop {{r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
+        ))
+    }
+    let Some(v) = v.last_chunk() else { return };
+    if coefficients.len() == out.len().wrapping_mul(16) && !out.is_empty() {
+        let (from, to) = (coefficients.as_ptr_range(), out.as_mut_ptr_range());
+        // SAFETY: as for six axes, with 16 numbers.
+        unsafe { all(from.end, to.end, to.start, v) }
+    }
+}
+
+/// Two axes of four.
+pub(super) fn cubic(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
+    #[unsafe(naked)]
+    unsafe extern "C" fn all(_: *const i32, _: *mut i32, _: *mut i32, _: &[i32; 2]) {
+        naked_asm!(concat!(
+            "push {{r4, r5, r6, r7, r8, r9, r10, r11, lr}}\n",
+            "ldrd r5, r6, [r3]\n",
+            "2:\n",
+            four!("r7", "r8", "r9", "r10"),
+            four!("r8", "r9", "r10", "r11"),
+            fold!("r8", "r5", "r7"),
+            four!("r9", "r10", "r11", "r12"),
+            fold!("r9", "r5", "r8"),
+            four!("r7", "r8", "r10", "r11"),
+            fold!("r7", "r5", "r9"),
+            next!(),
+            "pop {{r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
+        ))
+    }
+    let Some(v) = v.last_chunk() else { return };
+    if coefficients.len() == out.len().wrapping_mul(16) && !out.is_empty() {
+        let (from, to) = (coefficients.as_ptr_range(), out.as_mut_ptr_range());
+        // SAFETY: as for four axes of two.
+        unsafe { all(from.end, to.end, to.start, v) }
+    }
+}
