@@ -27,7 +27,7 @@
 //!
 //! 1. The operator: per output and block Horner's scheme, `lo + ⌊V · X / 2³²⌋` for every coefficient; the
 //!    blocks are added.
-//! 2. An output is multiplied with 2^shift of its coordinate (to the right: to nearest, ties up). It is
+//! 2. An output is multiplied with 2^shift of its coordinate (a negative one: to nearest, ties up). It is
 //!    the next value, or the change, which is added; the change of a pose is turned first,
 //!    `(c · a ∓ s · b) · 2^(shift − 31)` in 64 bits and rounded once.
 //! 3. Sine and cosine of an absolute angle are put back on the circle by an approximation of 1 / √n
@@ -47,33 +47,38 @@
 //! |---|---|
 //! | 1 | bytes: states n, inputs m, blocks b, factors f |
 //! | 1 | bytes: x, y, heading of an se(2) pose, and 1; or 0 |
-//! | 5 n | coordinates, below |
-//! | 2 m | inputs: centre and full scale, f32 |
-//! | 3 f | factors of all blocks, below |
+//! | 10 n | coordinates, below |
+//! | 5 m | inputs, below |
+//! | f | factors of all blocks; byte 0: register; byte 1: radix, order + 1 |
 //! | b | blocks: number of factors |
 //! | | coefficients, i32, `[blocks, outputs, terms]`, the first factor of a block slowest |
 //!
 //! | word of a coordinate | what |
 //! |---|---|
-//! | 0 | byte 0: kind; byte 1: shift, signed |
-//! | 1, 2 | least value (i32) and span (u32): outside them a prediction has diverged |
-//! | 3, 4 | centre and full scale, f32; 0 and π for an angle |
+//! | 0 | byte 0: kind; byte 1: shift, signed; byte 2: the first of its outputs; byte 3: observable α |
+//! | 1 | bytes: registers of value, sine and cosine, 31 for what is not kept; byte 3: observable β |
+//! | 2, 3 | least value (i32) and span (u32): outside them a prediction has diverged |
+//! | 4, 5 | trained range of the value, or the sine, α: half of the least and of the last one (i32) |
+//! | 6, 7 | the same of the cosine, β |
+//! | 8, 9 | centre and full scale, f32; 0 and π for an angle |
 //!
-//! | kind | output | least value and span are those of |
-//! |---|---|---|
-//! | 0 | the next value | the output |
-//! | 1 | the change | the next value |
-//! | 2 | two: the next sine and cosine, in Q(31 − shift) | nothing |
-//! | 3 | the change of an angle | the next value |
-//! | 4 | the same; sine and cosine are kept | the next value |
-//! | 5 | the change of x or y of the pose, in the body frame | the next value |
-//!
-//! | word of a factor | what |
+//! | word of an input | what |
 //! |---|---|
-//! | 0 | byte 0: register; byte 1: radix, order + 1; byte 2: index of the observable in the metadata |
-//! | 1, 2 | trained range: least value (i32) and span (u32) |
+//! | 0 | byte 0: register; byte 1: observable |
+//! | 1, 2 | trained range: half of the least and of the last value (i32) |
+//! | 3, 4 | centre and full scale, f32 |
 //!
-//! Register i is input i; 8 + 3 i, 9 + 3 i, 10 + 3 i are value, sine and cosine of coordinate i. Sine and
+//! | kind | output | kept | least value and span are those of |
+//! |---|---|---|---|
+//! | 0 | the next value | value | the output |
+//! | 1 | the change | value | the next value |
+//! | 2 | two: the next sine and cosine, in Q(31 − shift) | sine, cosine | nothing |
+//! | 3 | the change of an angle | value | the next value |
+//! | 4 | the change of an angle | value, sine, cosine | the next value |
+//! | 5 | the change of x or y of the pose, in the body frame | value | the next value |
+//!
+//! Every number that is kept has a register of its own, from 0 to 30; a block whose factors are registers
+//! 0, 1, … in order is folded where they lie. Observables are counted as in the metadata. Sine and
 //! cosine are in Q31. The self-test (kind 0x0003, encoding 7) is i32, coordinates, inputs, and the
 //! coordinates one step later, which have to come out exactly.
 
@@ -87,18 +92,18 @@ use crate::predictor::{OutOfRange, PredictError};
 mod circle;
 mod kernel;
 
-use kernel::{MAX_TILES, Tile};
+use kernel::{MAX_TILES, Tiles};
 
 /// Blocks of a model in fixed point.
 pub const MAX_BLOCKS: usize = 16;
 /// Factors of all of its blocks.
 pub const MAX_FACTORS: usize = 64;
 
-/// Registers: inputs, and value, sine and cosine of every coordinate.
+/// Registers: inputs, and value, sine and cosine of every coordinate as far as they are kept.
 const REGISTERS: usize = 32;
-/// The first register of a coordinate.
-const COORDINATES: usize = 8;
-const _: () = assert!(MAX_INPUTS <= COORDINATES && COORDINATES + 3 * MAX_STATES == REGISTERS);
+/// Where goes what is not kept.
+const NOWHERE: usize = 31;
+const _: () = assert!(MAX_INPUTS + 3 * MAX_STATES <= NOWHERE && MAX_OUTPUTS == 16);
 
 type Bank = [i32; REGISTERS];
 
@@ -245,12 +250,13 @@ impl From<ParseError> for LoadError {
 
 /// How a block is folded.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Plan {
-    factors: u8,
-    tile: Tile,
-    tiles: u8,
-    /// Coefficients of all outputs.
-    coefficients: u32,
+struct Plan<'a> {
+    factors: &'a [i32],
+    tiles: Tiles<'a>,
+    /// Tiles of an output.
+    count: u8,
+    /// Its factors are the first registers in order.
+    in_place: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -271,11 +277,11 @@ pub struct FixedModel<'a> {
     tag: u32,
     outputs: u8,
     pose: Option<Pose>,
-    coordinates: &'a [[i32; 5]],
-    inputs: &'a [[u32; 2]],
-    factors: &'a [[i32; 3]],
-    blocks: Vec<Plan, MAX_BLOCKS>,
-    coefficients: &'a [i32],
+    coordinates: &'a [[i32; 10]],
+    inputs: &'a [[i32; 5]],
+    /// One block of six axes of two in place; otherwise the blocks.
+    six: Option<&'a [[i32; 64]]>,
+    blocks: Vec<Plan<'a>, MAX_BLOCKS>,
 }
 
 /// All that moves while a model in fixed point predicts.
@@ -284,13 +290,20 @@ pub struct FixedState {
     /// The present sample, and where the next one is made.
     banks: [Bank; 2],
     present: bool,
+    /// Less than 0: the present sample is outside the trained range.
+    outside: i32,
     /// Which model it belongs to; 0: nothing observed yet.
     model: u32,
     step: u32,
     out_of_range: Option<OutOfRange>,
-    /// What a step makes on the way.
-    values: [i32; MAX_BLOCK_FACTORS],
     outputs: [i32; MAX_OUTPUTS],
+    scratch: Scratch,
+}
+
+/// What a step makes on the way.
+#[derive(Clone, Debug)]
+struct Scratch {
+    values: [i32; MAX_BLOCK_FACTORS],
     room: [i32; MAX_TILES],
 }
 
@@ -299,12 +312,15 @@ impl Default for FixedState {
         Self {
             banks: [[0; REGISTERS]; 2],
             present: false,
+            outside: 0,
             model: 0,
             step: 0,
             out_of_range: None,
-            values: [0; MAX_BLOCK_FACTORS],
             outputs: [0; MAX_OUTPUTS],
-            room: [0; MAX_TILES],
+            scratch: Scratch {
+                values: [0; MAX_BLOCK_FACTORS],
+                room: [0; MAX_TILES],
+            },
         }
     }
 }
@@ -335,20 +351,21 @@ impl FixedState {
 
 /// Register `index`, which a checked model keeps below [`REGISTERS`].
 #[inline(always)]
-fn register(bank: &Bank, index: i32) -> i32 {
+fn get(bank: &Bank, index: i32) -> i32 {
     bank.get(index as usize & (REGISTERS - 1)).copied().unwrap_or_default()
 }
 
-/// Value, sine and cosine of every coordinate.
 #[inline(always)]
-fn coordinates(bank: &Bank) -> &[[i32; 3]] {
-    bank.last_chunk::<{ 3 * MAX_STATES }>().map_or(&[], |registers| registers.as_chunks().0)
+fn set(bank: &mut Bank, index: i32, x: i32) {
+    if let Some(register) = bank.get_mut(index as usize & (REGISTERS - 1)) {
+        *register = x;
+    }
 }
 
+/// Less than 0 if a number is outside its trained range: without the last bit nothing overflows.
 #[inline(always)]
-fn coordinates_mut(bank: &mut Bank) -> &mut [[i32; 3]] {
-    let registers = bank.last_chunk_mut::<{ 3 * MAX_STATES }>();
-    registers.map_or(&mut [], |registers| registers.as_chunks_mut().0)
+fn beyond(x: i32, low: i32, high: i32) -> i32 {
+    (x >> 1).wrapping_sub(low) | high.wrapping_sub(x >> 1)
 }
 
 /// Whether a number is below the least or above the last of a range.
@@ -366,6 +383,16 @@ fn shifted(x: i32, shift: i32) -> i32 {
         // The bound of an output leaves room for the 1.
         x.wrapping_shr(shift.wrapping_neg().wrapping_sub(1) as u32).wrapping_add(1) >> 1
     }
+}
+
+/// `x + z · 2^shift`, if it fits.
+#[inline(always)]
+fn change(x: i32, z: i32, shift: i32) -> Option<i32> {
+    if shift <= 0 {
+        return x.checked_add(shifted(z, shift));
+    }
+    let change = i64::from(z).wrapping_shl(shift as u32);
+    i32::try_from(change.wrapping_add(i64::from(x))).ok()
 }
 
 #[inline(always)]
@@ -394,17 +421,16 @@ impl<'a> FixedModel<'a> {
         self.outputs.into()
     }
 
-    /// Coefficients of all outputs.
-    pub fn coefficients(&self) -> &'a [i32] {
-        self.coefficients
+    /// Coefficients of all outputs, block by block.
+    pub fn coefficients(&self) -> impl Iterator<Item = &'a [i32]> {
+        self.blocks.iter().map(|plan| plan.tiles.coefficients())
     }
 
     /// Kind and shift of every coordinate, and what its integers stand for.
     pub fn coordinates_of(&self) -> impl Iterator<Item = (Kind, i32, Scale)> {
-        self.coordinates.iter().map(|[head, _, _, centre, full]| {
+        self.coordinates.iter().map(|[head, .., centre, full]| {
             let kind = Kind::of(*head).unwrap_or(Kind::Next);
-            let float = |bits: i32| f32::from_bits(bits as u32);
-            let line = Scale::Line { centre: float(*centre), full: float(*full) };
+            let line = scale(*centre, *full);
             (kind, shift_of(*head), if kind.angle() { Scale::Turn } else { line })
         })
     }
@@ -416,10 +442,7 @@ impl<'a> FixedModel<'a> {
 
     /// What the integers of an input stand for.
     pub fn input_scale(&self, input: usize) -> Option<Scale> {
-        self.inputs.get(input).map(|[centre, full]| Scale::Line {
-            centre: f32::from_bits(*centre),
-            full: f32::from_bits(*full),
-        })
+        self.inputs.get(input).map(|[.., centre, full]| scale(*centre, *full))
     }
 
     /// Takes a measurement: `coordinates`, shape `[states]`, each in its [scale](Self::coordinate_scale).
@@ -433,15 +456,22 @@ impl<'a> FixedModel<'a> {
     ) -> Result<(), PredictError> {
         expect("coordinates", self.coordinates.len(), coordinates.len())?;
         let (bank, _) = state.banks();
-        let registers = coordinates_mut(bank).iter_mut();
-        for ((to, [head, ..]), x) in registers.zip(self.coordinates).zip(coordinates) {
-            let (sin, cos) = match Kind::of(*head) {
-                Some(Kind::Circle | Kind::Heading) => circle::sin_cos(*x),
-                _ => (0, circle::ONE),
-            };
-            *to = [*x, sin, cos];
+        let mut outside = 0;
+        for ([head, registers, _, _, low, high, last @ ..], x) in
+            self.coordinates.iter().zip(coordinates)
+        {
+            let (sin, cos) = circle::sin_cos(*x);
+            let angle = matches!(Kind::of(*head), Some(Kind::Circle | Kind::Heading));
+            set(bank, *registers, *x);
+            set(bank, registers >> 8, sin);
+            set(bank, registers >> 16, cos);
+            outside |= beyond(if angle { sin } else { *x }, *low, *high);
+            if let ([low, high, ..], true) = (last, angle) {
+                outside |= beyond(cos, *low, *high);
+            }
         }
         (state.model, state.step, state.out_of_range) = (self.tag, 0, None);
+        state.outside = outside;
         Ok(())
     }
 
@@ -457,124 +487,135 @@ impl<'a> FixedModel<'a> {
             return Err(PredictError::NotReady { have: 0, need: 1 });
         }
         expect("inputs", self.inputs.len(), input.len())?;
-        let step = state.step.saturating_add(1);
+        let step = state.step.wrapping_add(1);
         let [a, b] = &mut state.banks;
         let (from, to) = if state.present { (b, a) } else { (a, b) };
-        for (register, u) in from.iter_mut().zip(input) {
-            *register = *u;
+        let mut outside = state.outside;
+        for ([register, low, high, ..], u) in self.inputs.iter().zip(input) {
+            set(from, *register, *u);
+            outside |= beyond(*u, *low, *high);
         }
-
-        let outputs = state.outputs.get_mut(..self.outputs.into()).unwrap_or_default();
-        let (mut factors, mut coefficients) = (self.factors, self.coefficients);
-        let mut out = false;
-        let (first, others) = self.blocks.split_first().ok_or(PredictError::Diverged { step })?;
-        {
-            let (own, rest) = factors.split_at_checked(first.factors.into()).unwrap_or_default();
-            let (c, more) =
-                coefficients.split_at_checked(first.coefficients as usize).unwrap_or_default();
-            (factors, coefficients) = (rest, more);
-            out |= gather(from, own, &mut state.values);
-            first.contract(own, &state.values, c, outputs, &mut state.room);
-        }
-        for plan in others {
-            let (own, rest) = factors.split_at_checked(plan.factors.into()).unwrap_or_default();
-            let (c, more) =
-                coefficients.split_at_checked(plan.coefficients as usize).unwrap_or_default();
-            (factors, coefficients) = (rest, more);
-            out |= gather(from, own, &mut state.values);
-            let mut block = [0; MAX_OUTPUTS];
-            let block = block.get_mut(..outputs.len()).unwrap_or_default();
-            plan.contract(own, &state.values, c, block, &mut state.room);
-            for (sum, z) in outputs.iter_mut().zip(block) {
-                // The bound is that of the sum.
-                *sum = sum.wrapping_add(*z);
+        match (self.six, from.first_chunk()) {
+            (Some(all), Some(v)) => {
+                let outputs = state.outputs.get_mut(..all.len()).unwrap_or_default();
+                kernel::six(v, all, outputs);
             }
+            _ => self.operate(from, &mut state.outputs, &mut state.scratch),
         }
-        if let Some(pose) = self.pose {
-            self.place(pose, from, to, outputs).ok_or(PredictError::Diverged { step })?;
-        }
-        self.retract(from, to, outputs).ok_or(PredictError::Diverged { step })?;
-        if out && state.out_of_range.is_none() {
+        let Some(next_outside) = self.retract(from, to, &state.outputs) else {
+            return Err(PredictError::Diverged { step });
+        };
+        if outside < 0 && state.out_of_range.is_none() {
             let observable = self.first_outside(from);
             state.out_of_range = observable.map(|observable| OutOfRange { step, observable });
         }
+        state.outside = next_outside;
         state.present = !state.present;
         state.step = step;
         Ok(())
     }
 
-    /// The next sample from the operator's outputs.
+    /// The outputs of any operator.
+    #[inline(never)]
+    fn operate(&self, from: &Bank, outputs: &mut [i32; MAX_OUTPUTS], scratch: &mut Scratch) {
+        let outputs = outputs.get_mut(..self.outputs.into()).unwrap_or_default();
+        for (i, plan) in self.blocks.iter().enumerate() {
+            if i == 0 {
+                plan.contract(from, outputs, scratch);
+                continue;
+            }
+            let mut block = [0; MAX_OUTPUTS];
+            let block = block.get_mut(..outputs.len()).unwrap_or_default();
+            plan.contract(from, block, scratch);
+            for (sum, z) in outputs.iter_mut().zip(block) {
+                // The bound is that of the sum; panics where overflow is checked.
+                *sum += *z;
+            }
+        }
+    }
+
+    /// The next sample from the operator's outputs, and less than 0 if it is outside the trained range; `None` if
+    /// there is none.
     #[inline(always)]
-    fn retract(&self, from: &Bank, to: &mut Bank, outputs: &[i32]) -> Option<()> {
-        let registers = coordinates(from).iter().zip(coordinates_mut(to));
-        let mut outputs = outputs.iter();
-        for ([head, low, span, ..], ([x, ..], next)) in self.coordinates.iter().zip(registers) {
-            let z = *outputs.next()?;
-            let shift = shift_of(*head);
-            match Kind::of(*head)? {
+    fn retract(&self, from: &Bank, to: &mut Bank, outputs: &[i32; MAX_OUTPUTS]) -> Option<i32> {
+        if let Some(pose) = self.pose {
+            self.place(pose, from, to, outputs)?;
+        }
+        let mut beyond_range = 0;
+        for [head, registers, low, span, least, last, least_cos, last_cos, ..] in self.coordinates {
+            let output = |i: i32| {
+                let index = (head >> 16).wrapping_add(i) as usize & (MAX_OUTPUTS - 1);
+                outputs.get(index).copied().unwrap_or_default()
+            };
+            let (z, shift) = (output(0), shift_of(*head));
+            let kind = Kind::of(*head)?;
+            let x = match kind {
                 Kind::Next => {
                     if outside(z, *low, *span) {
                         return None;
                     }
-                    let [to, ..] = next;
-                    *to = shifted(z, shift);
+                    let x = z.wrapping_shl(shift as u32);
+                    set(to, *registers, x);
+                    beyond_range |= beyond(x, *least, *last);
                     continue;
                 }
                 Kind::Circle => {
-                    let (sin, cos) = circle::on_circle(z, *outputs.next()?, shift as u32)?;
-                    let [_, to_sin, to_cos] = next;
-                    (*to_sin, *to_cos) = (sin, cos);
+                    let mut point = [0; 2];
+                    if !circle::on_circle(z, output(1), shift as u32, &mut point) {
+                        return None;
+                    }
+                    let [sin, cos] = point;
+                    set(to, registers >> 8, sin);
+                    set(to, registers >> 16, cos);
+                    beyond_range |= beyond(sin, *least, *last) | beyond(cos, *least_cos, *last_cos);
                     continue;
                 }
-                Kind::Change => {
-                    let [to, ..] = next;
-                    *to = if shift > 0 {
-                        let change = i64::from(z).wrapping_shl(shift as u32);
-                        i32::try_from(change.wrapping_add(i64::from(*x))).ok()?
-                    } else {
-                        x.checked_add(shifted(z, shift))?
-                    };
-                }
                 // Is there already.
-                Kind::Pose => {}
-                Kind::Turn => {
-                    let [to, ..] = next;
-                    *to = x.wrapping_add(shifted(z, shift));
+                Kind::Pose => get(to, *registers),
+                Kind::Change => change(get(from, *registers), z, shift)?,
+                Kind::Turn | Kind::Heading => {
+                    get(from, *registers).wrapping_add(shifted(z, shift))
                 }
-                Kind::Heading => {
-                    let [to, sin, cos] = next;
-                    *to = x.wrapping_add(shifted(z, shift));
-                    (*sin, *cos) = circle::sin_cos(*to);
-                }
-            }
-            let [x, ..] = next;
-            if outside(*x, *low, *span) {
+            };
+            if outside(x, *low, *span) {
                 return None;
             }
+            set(to, *registers, x);
+            if kind == Kind::Heading {
+                let (sin, cos) = circle::sin_cos(x);
+                set(to, registers >> 8, sin);
+                set(to, registers >> 16, cos);
+                beyond_range |= beyond(sin, *least, *last) | beyond(cos, *least_cos, *last_cos);
+            } else {
+                beyond_range |= beyond(x, *least, *last);
+            }
         }
-        Some(())
+        Some(beyond_range)
     }
 
     /// The next x and y of a pose.
     #[inline(never)]
-    fn place(&self, pose: Pose, from: &Bank, to: &mut Bank, outputs: &[i32]) -> Option<()> {
+    fn place(
+        &self,
+        pose: Pose,
+        from: &Bank,
+        to: &mut Bank,
+        outputs: &[i32; MAX_OUTPUTS],
+    ) -> Option<()> {
         let output = |index: u8| outputs.get(usize::from(index)).copied().map(i64::from);
         let (ahead, left) = (output(pose.ahead)?, output(pose.left)?);
-        let from = coordinates(from);
-        let [_, sin, cos] = *from.get(usize::from(pose.heading))?;
+        let [_, heading, ..] = self.coordinates.get(usize::from(pose.heading))?;
+        let (sin, cos) = (get(from, heading >> 8), get(from, heading >> 16));
         let (sin, cos) = (i64::from(sin), i64::from(cos));
         // Below 2⁶² both: the outputs are below 2³⁰.
         let x = cos.wrapping_mul(ahead).wrapping_sub(sin.wrapping_mul(left));
         let y = sin.wrapping_mul(ahead).wrapping_add(cos.wrapping_mul(left));
-        let to = coordinates_mut(to);
         for (index, change) in [(pose.x, x), (pose.y, y)] {
-            let index = usize::from(index);
-            let [head, ..] = self.coordinates.get(index)?;
+            let [head, registers, ..] = self.coordinates.get(usize::from(index))?;
             let down = 31_i32.wrapping_sub(shift_of(*head)) as u32;
             let change = change.wrapping_shr(down.wrapping_sub(1)).wrapping_add(1) >> 1;
-            let [x, ..] = *from.get(index)?;
-            let [next, ..] = to.get_mut(index)?;
-            *next = i32::try_from(change.wrapping_add(i64::from(x))).ok()?;
+            let next = change.wrapping_add(get(from, *registers).into());
+            set(to, *registers, i32::try_from(next).ok()?);
         }
         Some(())
     }
@@ -583,9 +624,17 @@ impl<'a> FixedModel<'a> {
     #[cold]
     #[inline(never)]
     fn first_outside(&self, bank: &Bank) -> Option<usize> {
-        let mut factors = self.factors.iter();
-        let found = factors.find(|[head, low, span]| outside(register(bank, head & 0xFF), *low, *span));
-        found.map(|[head, ..]| (head >> 16 & 0xFF) as usize)
+        let inputs = self.inputs.iter().map(|[head, low, high, ..]| (*head, *low, *high, head >> 8));
+        let states = self.coordinates.iter().flat_map(|[head, registers, _, _, low, high, last @ ..]| {
+            let [least_cos, last_cos, ..] = last;
+            let angle = matches!(Kind::of(*head), Some(Kind::Circle | Kind::Heading));
+            let first = if angle { registers >> 8 } else { *registers };
+            let cos = (registers >> 16, *least_cos, *last_cos, registers >> 24);
+            [Some((first, *low, *high, head >> 24)), angle.then_some(cos)].into_iter().flatten()
+        });
+        let mut all = states.chain(inputs);
+        let found = all.find(|(register, low, high, _)| beyond(get(bank, *register), *low, *high) < 0);
+        found.map(|(.., observable)| (observable & 0xFF) as usize)
     }
 
     /// The present coordinates in `out`, shape `[states]`, each in its [scale](Self::coordinate_scale):
@@ -596,12 +645,13 @@ impl<'a> FixedModel<'a> {
     pub fn coordinates(&self, state: &FixedState, out: &mut [i32]) -> Result<(), PredictError> {
         expect("coordinates", self.coordinates.len(), out.len())?;
         let [a, b] = &state.banks;
-        let registers = coordinates(if state.present { b } else { a });
-        for ((to, [x, sin, cos]), [head, ..]) in out.iter_mut().zip(registers).zip(self.coordinates)
-        {
+        let bank = if state.present { b } else { a };
+        for (to, [head, registers, ..]) in out.iter_mut().zip(self.coordinates) {
             *to = match Kind::of(*head) {
-                Some(Kind::Circle) => circle::angle(*sin, *cos),
-                _ => *x,
+                Some(Kind::Circle) => {
+                    circle::angle(get(bank, registers >> 8), get(bank, registers >> 16))
+                }
+                _ => get(bank, *registers),
             };
         }
         Ok(())
@@ -650,10 +700,10 @@ impl<'a> FixedModel<'a> {
         if n == 0 || b == 0 {
             return Err(section("counts"));
         }
-        let (coordinates, rest) = rest.split_at_checked(n.wrapping_mul(5)).ok_or(length)?;
-        let (inputs, rest) = rest.split_at_checked(m.wrapping_mul(2)).ok_or(length)?;
-        let (factors, rest) = rest.split_at_checked(f.wrapping_mul(3)).ok_or(length)?;
-        let (blocks, coefficients) = rest.split_at_checked(b).ok_or(length)?;
+        let (coordinates, rest) = rest.split_at_checked(n.wrapping_mul(10)).ok_or(length)?;
+        let (inputs, rest) = rest.split_at_checked(m.wrapping_mul(5)).ok_or(length)?;
+        let (mut factors, rest) = rest.split_at_checked(f).ok_or(length)?;
+        let (blocks, mut coefficients) = rest.split_at_checked(b).ok_or(length)?;
         let mut model = Self {
             robot,
             tag,
@@ -661,66 +711,57 @@ impl<'a> FixedModel<'a> {
             pose: None,
             coordinates: bytemuck::try_cast_slice(coordinates).map_err(|_| length)?,
             inputs: bytemuck::try_cast_slice(inputs).map_err(|_| length)?,
-            factors: bytemuck::try_cast_slice(factors).map_err(|_| length)?,
+            six: None,
             blocks: Vec::new(),
-            coefficients: bytemuck::try_cast_slice(coefficients).map_err(|_| length)?,
         };
-        let kinds = || model.coordinates.iter().map(|[head, ..]| Kind::of(*head));
         let mut outputs = 0_usize;
-        for kind in kinds() {
-            outputs = outputs.wrapping_add(kind.ok_or(section("kind of a coordinate"))?.outputs());
+        for [head, ..] in model.coordinates {
+            let kind = Kind::of(*head).ok_or(section("kind of a coordinate"))?;
+            outputs = outputs.wrapping_add(kind.outputs());
         }
         model.outputs = outputs as u8;
+        let observed = model.check_registers()?;
 
-        // Blocks and factors.
-        let mut rest = model.factors;
-        let mut used = 0_usize;
         for count in blocks {
             let count = usize::try_from(*count).unwrap_or(usize::MAX);
             if count > MAX_BLOCK_FACTORS {
                 return Err(too_large("factors of a block", MAX_BLOCK_FACTORS, count));
             }
-            let (own, others) = rest.split_at_checked(count).ok_or(section("blocks"))?;
-            rest = others;
-            for [head, ..] in own {
-                let [register, radix, _, zero] = head.to_le_bytes();
-                let radix_fits = (2..=MAX_ORDER.saturating_add(1)).contains(&radix);
-                let register = usize::from(register);
-                let fits = match register.checked_sub(COORDINATES) {
-                    None => register < m,
-                    Some(of) => {
-                        let kind = kinds().nth(of / 3).flatten();
-                        match of % 3 {
-                            0 => matches!(kind, Some(Kind::Next | Kind::Change)),
-                            _ => matches!(kind, Some(Kind::Circle | Kind::Heading)),
-                        }
-                    }
-                };
-                if !(fits && radix_fits && zero == 0) {
-                    return Err(section("factor"));
-                }
+            let (own, others) = factors.split_at_checked(count).ok_or(section("blocks"))?;
+            factors = others;
+            let own: &[i32] = bytemuck::try_cast_slice(own).map_err(|_| length)?;
+            let fits = |factor: &i32| {
+                let [register, radix, rest @ ..] = factor.to_le_bytes();
+                let register = 1_u32.checked_shl(register.into()).unwrap_or(0);
+                observed & register != 0
+                    && (2..=MAX_ORDER.saturating_add(1)).contains(&radix)
+                    && rest == [0, 0]
+            };
+            if !own.iter().all(fits) {
+                return Err(section("factor"));
             }
             let radices = own.iter().map(radix);
-            let tile = Tile::of(radices.clone());
             let product = |size: usize, radix| size.saturating_mul(radix);
-            let tiles = radices.clone().rev().skip(tile.axes()).fold(1, product);
-            if tiles > MAX_TILES {
-                return Err(too_large("tiles of a block", MAX_TILES, tiles));
+            let size = radices.clone().fold(1, product).saturating_mul(outputs);
+            let (all, others) = coefficients.split_at_checked(size).ok_or(length)?;
+            coefficients = others;
+            let all = bytemuck::try_cast_slice(all).map_err(|_| length)?;
+            let tiles = Tiles::new(radices.clone(), all);
+            let count = radices.rev().skip(tiles.axes()).fold(1, product);
+            if count > MAX_TILES {
+                return Err(too_large("tiles of a block", MAX_TILES, count));
             }
-            let size = radices.fold(1, product).saturating_mul(outputs);
-            used = used.saturating_add(size);
-            let plan = Plan {
-                factors: count as u8,
-                tile,
-                tiles: tiles as u8,
-                coefficients: u32::try_from(size).map_err(|_| length)?,
-            };
+            let in_place = (0..).zip(own).all(|(i, factor)| factor & 0xFF == i);
+            if let (Tiles::Six(all), 1, true, 1) = (tiles, count, in_place, b) {
+                model.six = Some(all);
+            }
+            let plan = Plan { factors: own, tiles, count: count as u8, in_place };
             model.blocks.push(plan).map_err(|_| section("blocks"))?;
         }
-        if !rest.is_empty() {
+        if !factors.is_empty() {
             return Err(section("blocks"));
         }
-        if used != model.coefficients.len() {
+        if !coefficients.is_empty() {
             return Err(length);
         }
         let bounds = model.bounds()?;
@@ -728,18 +769,54 @@ impl<'a> FixedModel<'a> {
         Ok(model)
     }
 
+    /// That every number that is kept has a register of its own; the registers that may be observed, a bit each.
+    fn check_registers(&self) -> Result<u32, LoadError> {
+        let section = LoadError::Section { field: "registers" };
+        let (mut used, mut observed) = (0_u32, 0_u32);
+        let mut take = |register: u8, observable: bool| {
+            let bit = 1_u32.checked_shl(register.into()).unwrap_or(0);
+            let free = usize::from(register) < NOWHERE && used & bit == 0;
+            used |= bit;
+            observed |= if observable { bit } else { 0 };
+            if free { Ok(()) } else { Err(section) }
+        };
+        for [head, ..] in self.inputs {
+            let [register, _, rest @ ..] = head.to_le_bytes();
+            take(register, true)?;
+            if rest != [0, 0] {
+                return Err(section);
+            }
+        }
+        for [head, registers, ..] in self.coordinates {
+            let kind = Kind::of(*head).ok_or(section)?;
+            let [value, sin, cos, _] = registers.to_le_bytes();
+            if kind != Kind::Circle {
+                take(value, matches!(kind, Kind::Next | Kind::Change))?;
+            }
+            let circle = matches!(kind, Kind::Circle | Kind::Heading);
+            if circle {
+                take(sin, true)?;
+                take(cos, true)?;
+            }
+            let nowhere = |register: u8| usize::from(register) == NOWHERE;
+            if (kind == Kind::Circle && !nowhere(value))
+                || (!circle && !(nowhere(sin) && nowhere(cos)))
+            {
+                return Err(section);
+            }
+        }
+        Ok(observed)
+    }
+
     /// The largest magnitude that every output can have.
     fn bounds(&self) -> Result<[u32; MAX_OUTPUTS], LoadError> {
         let mut bounds = [0_u32; MAX_OUTPUTS];
-        let (mut factors, mut coefficients) = (self.factors, self.coefficients);
         for plan in &self.blocks {
-            let (own, rest) = factors.split_at_checked(plan.factors.into()).unwrap_or_default();
-            let (c, more) =
-                coefficients.split_at_checked(plan.coefficients as usize).unwrap_or_default();
-            (factors, coefficients) = (rest, more);
-            let size = c.len().checked_div(self.outputs()).unwrap_or(0).max(1);
-            for ((output, bound), c) in bounds.iter_mut().enumerate().zip(c.chunks_exact(size)) {
-                let more = kernel::bound(own.iter().map(radix), c);
+            let coefficients = plan.tiles.coefficients();
+            let size = coefficients.len().checked_div(self.outputs()).unwrap_or(0).max(1);
+            let rows = coefficients.chunks_exact(size);
+            for ((output, bound), c) in bounds.iter_mut().enumerate().zip(rows) {
+                let more = kernel::bound(plan.factors.iter().map(radix), c);
                 let sum = more.and_then(|more| bound.checked_add(more));
                 // One less than what fits, for a rounding.
                 *bound = sum
@@ -756,7 +833,7 @@ impl<'a> FixedModel<'a> {
         let [x, y, heading, there] = pose.to_le_bytes();
         let (mut ahead, mut left, mut poses) = (None, None, 0_u8);
         let mut output = 0_u8;
-        for (index, [head, low, span, centre, full]) in (0_u8..).zip(self.coordinates) {
+        for (index, [head, _, low, span, .., centre, full]) in (0_u8..).zip(self.coordinates) {
             let kind = Kind::of(*head).ok_or(section("kind of a coordinate"))?;
             let shift = shift_of(*head);
             let bound = bounds.get(usize::from(output)).copied().unwrap_or_default();
@@ -767,14 +844,14 @@ impl<'a> FixedModel<'a> {
                 Kind::Next => {
                     let shifted = |x: i64| x << shift.clamp(0, 31);
                     let bound = i64::from(bound);
-                    (-31..=31).contains(&shift)
+                    (0..=31).contains(&shift)
                         && i32::try_from(shifted(low.max(-bound))).is_ok()
                         && i32::try_from(shifted(high.min(bound))).is_ok()
                 }
                 Kind::Change | Kind::Turn | Kind::Heading => (-31..=31).contains(&shift),
                 Kind::Pose => (-30..=30).contains(&shift) && bound < 1 << 30,
             };
-            if !shift_fits || *head >> 16 != 0 {
+            if !shift_fits || head >> 16 & 0xFF != i32::from(output) {
                 return Err(section("shift of a coordinate"));
             }
             if high > i64::from(i32::MAX) {
@@ -799,14 +876,14 @@ impl<'a> FixedModel<'a> {
         self.pose = match (there, poses, ahead, left) {
             (0, 0, ..) if pose == 0 => None,
             (1, 2, Some(ahead), Some(left))
-                if head(heading).and_then(Kind::of) == Some(Kind::Heading) && head(x) == head(y) =>
+                if head(heading).and_then(Kind::of) == Some(Kind::Heading) && head(x).map(shift_of) == head(y).map(shift_of) =>
             {
                 Some(Pose { x, y, heading, ahead, left })
             }
             _ => return Err(section("pose")),
         };
-        let fits = |[centre, full]: &[u32; 2]| {
-            let (centre, full) = (f32::from_bits(*centre), f32::from_bits(*full));
+        let fits = |[.., centre, full]: &[i32; 5]| {
+            let (centre, full) = (f32::from_bits(*centre as u32), f32::from_bits(*full as u32));
             centre.is_finite() && full.is_finite() && full > 0.0
         };
         if self.inputs.iter().all(fits) { Ok(()) } else { Err(section("scale of an input")) }
@@ -822,38 +899,31 @@ impl<'a> FixedModel<'a> {
     }
 }
 
-impl Plan {
+impl Plan<'_> {
     #[inline(always)]
-    fn contract(
-        self,
-        factors: &[[i32; 3]],
-        values: &[i32],
-        coefficients: &[i32],
-        outputs: &mut [i32],
-        room: &mut [i32; MAX_TILES],
-    ) {
-        let radices = factors.iter().map(radix);
-        let v = values.get(..factors.len()).unwrap_or_default();
-        kernel::contract(self.tile, self.tiles.into(), radices, v, coefficients, outputs, room);
+    fn contract(&self, bank: &Bank, outputs: &mut [i32], scratch: &mut Scratch) {
+        let v = match self.in_place {
+            true => bank.get(..self.factors.len()).unwrap_or_default(),
+            false => {
+                for (to, factor) in scratch.values.iter_mut().zip(self.factors) {
+                    *to = get(bank, *factor);
+                }
+                scratch.values.get(..self.factors.len()).unwrap_or_default()
+            }
+        };
+        let radices = self.factors.iter().map(radix);
+        self.tiles.contract(self.count.into(), radices, v, outputs, &mut scratch.room);
     }
 }
 
 /// Radix of a factor.
 #[inline(always)]
-fn radix([head, ..]: &[i32; 3]) -> usize {
-    (head >> 8 & 0xFF) as usize
+fn radix(factor: &i32) -> usize {
+    (factor >> 8 & 0xFF) as usize
 }
 
-/// The observables of a block in order; whether one is outside its range.
-#[inline(always)]
-fn gather(bank: &Bank, factors: &[[i32; 3]], values: &mut [i32]) -> bool {
-    let mut out = false;
-    for (to, [head, low, span]) in values.iter_mut().zip(factors) {
-        let x = register(bank, *head);
-        out |= outside(x, *low, *span);
-        *to = x;
-    }
-    out
+fn scale(centre: i32, full: i32) -> Scale {
+    Scale::Line { centre: f32::from_bits(centre as u32), full: f32::from_bits(full as u32) }
 }
 
 #[inline]

@@ -132,7 +132,7 @@ impl From<LoadError> for FixedError {
 #[derive(Clone, Copy, Debug)]
 struct Axis {
     radix: usize,
-    register: u8,
+    reads: Source,
     observable: u8,
     range: [i32; 2],
 }
@@ -341,19 +341,19 @@ impl FixedBlock {
                 let [low, high] = range(i).map(q31);
                 [low.saturating_sub(SLACK), high.saturating_add(SLACK)]
             };
-            let (register, scale) = match observable.source {
-                Source::State(i) => (8 + 3 * i, scales.states[usize::from(i)]),
-                Source::Sin(i) => (9 + 3 * i, None),
-                Source::Cos(i) | Source::Increment(i) => (10 + 3 * i, None),
-                Source::Input(i) => (i, Some(scales.inputs[usize::from(i)])),
+            let reads = observable.source;
+            let scale = match reads {
+                Source::State(i) => scales.states[usize::from(i)],
+                Source::Input(i) => Some(scales.inputs[usize::from(i)]),
+                Source::Sin(_) | Source::Cos(_) | Source::Increment(_) => None,
             };
             if factor.basis == Basis::Fourier {
                 let observable = factor.observable;
                 let cosine = index + 1;
-                axes.push(Axis { radix: 2, register, observable, range: circle(index) });
+                axes.push(Axis { radix: 2, reads, observable, range: circle(index) });
                 axes.push(Axis {
                     radix,
-                    register: register + 1,
+                    reads: observables[cosine].source,
                     observable: observable + 1,
                     range: circle(cosine),
                 });
@@ -368,7 +368,7 @@ impl FixedBlock {
             };
             let gain = f64::from(observable.gain);
             let shift = gain * (centre - f64::from(observable.centre));
-            axes.push(Axis { radix, register, observable: factor.observable, range });
+            axes.push(Axis { radix, reads, observable: factor.observable, range });
             changes.push((powers_of(gain * full, shift, radix), radix));
         }
         let order = fastest(&axes);
@@ -523,13 +523,13 @@ pub fn fixed_point(
     }
 
     let exponents = exponents(structure, &kinds, &blocks)?;
-    let mut words = Words::new(structure, &blocks)?;
+    let mut words = Words::new(structure, &kinds, &blocks)?;
     let mut coordinates = Vec::new();
     let mut output = 0;
     for ((state, kind), scale) in structure.states().iter().zip(&kinds).zip(&scales.states) {
         let (exponent, bound) = exponents[output];
         let scale = scale.unwrap_or(Scale::Turn);
-        words.coordinate(*kind, exponent, state.limit, scale);
+        words.coordinate(coordinates.len(), (*kind, output), exponent, state.limit, scale);
         let (centre, full_scale) = parts(scale);
         coordinates.push(FixedCoordinate {
             name: state.name.to_owned(),
@@ -541,25 +541,25 @@ pub fn fixed_point(
         });
         output += if *kind == Kind::Circle { 2 } else { 1 };
     }
-    let inputs = structure.inputs().iter().zip(&scales.inputs).map(|(input, scale)| {
-        words.floats(*scale);
+    let mut inputs = Vec::new();
+    for (input, scale) in structure.inputs().iter().zip(&scales.inputs) {
+        words.input(inputs.len(), *scale);
         let (centre, full_scale) = parts(*scale);
-        FixedInput {
+        inputs.push(FixedInput {
             name: input.name.to_owned(),
             unit: input.unit.to_owned(),
             centre,
             full_scale,
-        }
-    });
-    let inputs = inputs.collect();
+        });
+    }
     words.blocks(&blocks, &exponents);
 
     // Without delays the self-test is of one sample.
     let all = scales.states.iter().map(|scale| scale.unwrap_or(Scale::Turn));
     let all = all.zip(test.states).chain(scales.inputs.iter().copied().zip(test.inputs));
     let sample: Vec<i32> = all.map(|(scale, x)| scale.to_fixed(f64::from(*x))).collect();
-    let mut bytes = vec![0; 4 * words.0.len() + METADATA_AND_TEST];
-    let length = q31::emit(structure, &words.0, &sample, &mut bytes)?;
+    let mut bytes = vec![0; 4 * words.words.len() + METADATA_AND_TEST];
+    let length = q31::emit(structure, &words.words, &sample, &mut bytes)?;
     bytes.truncate(length);
     let coefficients = blocks.iter().flat_map(|b| &b.coefficients).map(Vec::len).sum();
     Ok(FixedExport { bytes, coefficients, coordinates, inputs })
@@ -656,6 +656,7 @@ fn exponents(
         match kind {
             Kind::Circle => groups.push((vec![output, output + 1], 0, 1 << 31)),
             Kind::Pose => pose.push(output),
+            Kind::Next => groups.push((vec![output], 0, 1 << 31)),
             _ => groups.push((vec![output], -31, 1 << 31)),
         }
         output += if *kind == Kind::Circle { 2 } else { 1 };
@@ -690,11 +691,20 @@ fn exponents(
 }
 
 /// The section of the blob, word by word.
-struct Words(Vec<u32>);
+struct Words {
+    words: Vec<u32>,
+    /// What lies in registers 0, 1, …, and the observable and range of what is observed.
+    registers: Vec<(Source, Option<Axis>)>,
+}
 
 impl Words {
-    fn new(structure: &Structure<'_>, blocks: &[FixedBlock]) -> Result<Self, FixedError> {
-        let factors: usize = blocks.iter().map(|block| block.axes.len()).sum();
+    fn new(
+        structure: &Structure<'_>,
+        kinds: &[Kind],
+        blocks: &[FixedBlock],
+    ) -> Result<Self, FixedError> {
+        let axes = blocks.iter().flat_map(|block| &block.axes);
+        let factors = axes.clone().count();
         let room = [("blocks", blocks.len(), q31::MAX_BLOCKS), ("factors", factors, q31::MAX_FACTORS)];
         if let Some((field, found, capacity)) = room.into_iter().find(|(_, n, most)| n > most) {
             return Err(LoadError::TooLarge { field, capacity, found }.into());
@@ -704,15 +714,57 @@ impl Words {
             Symmetry::Se2 { x, y, heading } => [x, y, heading, 1],
             _ => [0; 4],
         };
-        Ok(Self(vec![u32::from_le_bytes(counts.map(|n| n as u8)), u32::from_le_bytes(pose)]))
+        let words = vec![u32::from_le_bytes(counts.map(|n| n as u8)), u32::from_le_bytes(pose)];
+        // The factors of the first block lie where they are folded.
+        let mut registers: Vec<(Source, Option<Axis>)> = Vec::new();
+        let mut keep = |source: Source, axis: Option<Axis>| {
+            if registers.iter().all(|(kept, _)| *kept != source) {
+                registers.push((source, axis));
+            }
+        };
+        for axis in axes {
+            keep(axis.reads, Some(*axis));
+        }
+        (0..structure.inputs().len()).for_each(|i| keep(Source::Input(i as u8), None));
+        for (i, kind) in (0_u8..).zip(kinds) {
+            if *kind != Kind::Circle {
+                keep(Source::State(i), None);
+            }
+            if matches!(kind, Kind::Circle | Kind::Heading) {
+                keep(Source::Sin(i), None);
+                keep(Source::Cos(i), None);
+            }
+        }
+        Ok(Self { words, registers })
     }
 
     fn floats(&mut self, scale: Scale) {
         let (centre, full) = parts(scale);
-        self.0.extend([(centre as f32).to_bits(), (full as f32).to_bits()]);
+        self.words.extend([(centre as f32).to_bits(), (full as f32).to_bits()]);
     }
 
-    fn coordinate(&mut self, kind: Kind, shift: i32, limit: [f32; 2], scale: Scale) {
+    /// The register of something and the observable that it is; 31 and none if it is not kept.
+    fn register(&self, source: Source) -> (u8, u8) {
+        let found = self.registers.iter().position(|(kept, _)| *kept == source);
+        let observable = found.and_then(|i| self.registers[i].1).map_or(0, |axis| axis.observable);
+        (found.map_or(31, |i| i as u8), observable)
+    }
+
+    /// The trained range of something without its last bit, or everything.
+    fn range(&self, source: Source) -> [u32; 2] {
+        let found = self.registers.iter().find(|(kept, _)| *kept == source);
+        let range = found.and_then(|(_, axis)| *axis).map_or([i32::MIN, i32::MAX], |axis| axis.range);
+        range.map(|x| (x >> 1) as u32)
+    }
+
+    fn coordinate(
+        &mut self,
+        index: usize,
+        (kind, output): (Kind, usize),
+        shift: i32,
+        limit: [f32; 2],
+        scale: Scale,
+    ) {
         // The limits, where there are any, in integers of the coordinate.
         let [low, high] = limit;
         let mut low = if low.is_finite() { scale_up(scale, low) } else { i32::MIN };
@@ -723,26 +775,40 @@ impl Words {
             low = (f64::from(low) / unit).ceil() as i32;
             high = (f64::from(high) / unit).floor() as i32;
         }
-        if kind == Kind::Circle {
-            (low, high) = (i32::MIN, i32::MAX);
-        }
-        let head = u32::from_le_bytes([kind as u8, shift as i8 as u8, 0, 0]);
-        self.0.extend([head, low as u32, high.wrapping_sub(low) as u32]);
+        let index = index as u8;
+        let value = self.register(Source::State(index));
+        let (sin, cos) = (self.register(Source::Sin(index)), self.register(Source::Cos(index)));
+        let angle = matches!(kind, Kind::Circle | Kind::Heading);
+        let first = if angle { Source::Sin(index) } else { Source::State(index) };
+        let observable = if angle { sin.1 } else { value.1 };
+        let head = [kind as u8, shift as i8 as u8, output as u8, observable];
+        let registers = [value.0, sin.0, cos.0, cos.1];
+        self.words.extend([head, registers].map(u32::from_le_bytes));
+        self.words.extend([low as u32, high.wrapping_sub(low) as u32]);
+        self.words.extend(self.range(first));
+        self.words.extend(self.range(Source::Cos(index)));
+        self.floats(scale);
+    }
+
+    fn input(&mut self, index: usize, scale: Scale) {
+        let source = Source::Input(index as u8);
+        let (register, observable) = self.register(source);
+        self.words.push(u32::from_le_bytes([register, observable, 0, 0]));
+        self.words.extend(self.range(source));
         self.floats(scale);
     }
 
     fn blocks(&mut self, blocks: &[FixedBlock], exponents: &[(i32, u32)]) {
         for axis in blocks.iter().flat_map(|block| &block.axes) {
-            let [low, high] = axis.range;
-            let head = [axis.register, axis.radix as u8, axis.observable, 0];
-            self.0.extend([u32::from_le_bytes(head), low as u32, high.wrapping_sub(low) as u32]);
+            let (register, _) = self.register(axis.reads);
+            self.words.push(u32::from_le_bytes([register, axis.radix as u8, 0, 0]));
         }
-        self.0.extend(blocks.iter().map(|block| block.axes.len() as u32));
+        self.words.extend(blocks.iter().map(|block| block.axes.len() as u32));
         for block in blocks {
             for (output, (exponent, _)) in exponents.iter().enumerate() {
                 // They fit: that is how the exponent was found.
                 let integers = block.integers(output, *exponent).unwrap_or_default();
-                self.0.extend(integers.iter().map(|c| *c as u32));
+                self.words.extend(integers.iter().map(|c| *c as u32));
             }
         }
     }

@@ -3,8 +3,6 @@
 
 use super::kernel::high;
 
-/// 1, as near as Q31 comes.
-pub(super) const ONE: i32 = i32::MAX;
 /// sin(π/4 · u) / u in u², highest power first, in Q37, Q35, Q33, Q31: minimax for |u| ≤ 1, off by 2.4e-9.
 const SIN: [i32; 4] = [-4_941_550, 85_555_993, -693_598_004, 1_686_629_708];
 /// (cos(π/4 · u) − 1) / u² in u², highest power first, in Q38, Q36, Q34, Q32: off by 5e-11.
@@ -42,8 +40,8 @@ const ATAN: [i32; 30] = [
     3,
     1,
 ];
-/// 1 / (2 √n) in n within [0.25, 2): highest power first, in Q32, Q31, Q29; off by 7.4 % at most.
-const HALF_RECIPROCAL_ROOT: [i32; 3] = [1_083_731_345, -1_889_754_434, 606_848_070];
+/// 1 / (2 √n) in n within [0.25, 2]: highest power first, in Q32, Q31, Q28; off by 7.4 % at most.
+const HALF_RECIPROCAL_ROOT: [i32; 3] = [1_083_731_345, -1_889_754_434, 303_424_035];
 /// How much shorter than 1 sine and cosine may be before they have lost their direction: 2⁻¹⁰.
 const SHORTEST: u32 = 10;
 
@@ -98,29 +96,35 @@ pub(super) fn angle(sin: i32, cos: i32) -> i32 {
     angle
 }
 
-/// Sine and cosine of scale 2^(31 − `shift`), neither −2³¹, back on the circle and in Q31, off by at most
-/// 3e-8 of their length; `None` if they have lost their direction.
+/// `y (3 − 4 n y²) / 2` for y in Q31 and n in Q30.
 #[inline(always)]
-pub(super) fn on_circle(sin: i32, cos: i32, shift: u32) -> Option<(i32, i32)> {
-    let zeros = sin.unsigned_abs().max(cos.unsigned_abs()).leading_zeros();
+fn newton(n: u32, y: u32) -> u32 {
+    let product = high_unsigned(n, high_unsigned(y, y)) << 4;
+    ((u64::from(y) * u64::from((3_u32 << 30).wrapping_sub(product))) >> 31) as u32
+}
+
+/// Sine and cosine of scale 2^(31 − `shift`) back on the circle and in Q31, off by at most 3e-8 of their length;
+/// whether they have not lost their direction.
+#[inline(never)]
+pub(super) fn on_circle(sin: i32, cos: i32, shift: u32, to: &mut [i32; 2]) -> bool {
+    // Of the larger one; −2ᵏ has one more than 2ᵏ.
+    let zeros = ((sin ^ (sin >> 31)) | (cos ^ (cos >> 31))).leading_zeros();
     if zeros > shift.wrapping_add(SHORTEST) {
-        return None;
+        return false;
     }
-    // The larger one within [2³⁰, 2³¹): the square n of the length, in Q30, is within [0.25, 2).
+    // The larger one within [2³⁰, 2³¹]: the square n of the length, in Q30, is within [0.25, 2].
     let up = zeros.wrapping_sub(1) & 31;
     let (sin, cos) = (sin << up, cos << up);
-    let square = high(sin, sin).wrapping_add(high(cos, cos));
+    let n = (high(sin, sin) as u32).wrapping_add(high(cos, cos) as u32);
+    let half = (n >> 1) as i32;
     let [a, b, c] = HALF_RECIPROCAL_ROOT;
-    let guess = c.wrapping_add(high(square, b.wrapping_add(high(square, a) << 1)));
-    // In Q31: y = 1 / (2 √n) by Newton's method, y ← y (3 − 4 n y²) / 2.
-    let (n, mut y) = (square as u32, (guess as u32) << 2);
-    for _ in 0..2 {
-        let product = high_unsigned(n, high_unsigned(y, y)) << 4;
-        y = high_unsigned(y, (3_u32 << 30).wrapping_sub(product)) << 1;
-    }
+    let guess = c.wrapping_add(high(half, b.wrapping_add(high(half, a) << 2)));
+    // In Q31: y = 1 / (2 √n) by Newton's method.
+    let y = newton(n, newton(n, (guess as u32) << 3));
     let product = ((u64::from(n) * u64::from(high_unsigned(y, y))) >> 28) as u32;
     let y = high_unsigned(y, (3_u32 << 30).wrapping_sub(product)) as i32;
     // Half of it in Q31 is it in Q30, and products are in Q28.
     let put = |x: i32| high(x, y).clamp(-(1 << 28), (1 << 28) - 1) << 3;
-    Some((put(sin), put(cos)))
+    *to = [put(sin), put(cos)];
+    true
 }

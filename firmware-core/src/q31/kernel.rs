@@ -38,34 +38,37 @@ pub(super) fn high(a: i32, b: i32) -> i32 {
     ((i64::from(a) * i64::from(b)) >> 32) as i32
 }
 
-/// The fastest axes of a block, which are folded in one go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Tile {
+/// The coefficients of a block in tiles: the fastest axes, which are folded in one go.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Tiles<'a> {
     /// Six axes of two.
-    Six,
+    Six(&'a [[i32; 64]]),
     /// Four axes of two.
-    Four,
+    Four(&'a [[i32; 16]]),
     /// Two axes of four.
-    Cubic,
+    Cubic(&'a [[i32; 16]]),
     /// That many axes, of up to [`AT_ONCE`] coefficients.
-    Other(u8),
+    Other(u8, &'a [i32]),
 }
 
-impl Tile {
-    /// The tile of a block with these radices, the first axis slowest.
-    pub(super) fn of(radices: impl DoubleEndedIterator<Item = usize> + Clone) -> Self {
+impl<'a> Tiles<'a> {
+    /// Of a block with these radices, the first axis slowest.
+    pub(super) fn new(
+        radices: impl DoubleEndedIterator<Item = usize> + Clone,
+        coefficients: &'a [i32],
+    ) -> Self {
         let ends_with = |radix: usize, count: usize| {
             let fast = radices.clone().rev().take(count);
             fast.filter(|r| *r == radix).count() == count
         };
         if ends_with(2, 6) {
-            return Self::Six;
+            return Self::Six(coefficients.as_chunks().0);
         }
         if ends_with(2, 4) {
-            return Self::Four;
+            return Self::Four(coefficients.as_chunks().0);
         }
         if ends_with(4, 2) {
-            return Self::Cubic;
+            return Self::Cubic(coefficients.as_chunks().0);
         }
         let (mut size, mut axes) = (1_usize, 0_u8);
         for radix in radices.rev() {
@@ -75,121 +78,139 @@ impl Tile {
             }
             axes = axes.saturating_add(1);
         }
-        Self::Other(axes)
+        Self::Other(axes, coefficients)
     }
 
-    /// How many axes it folds.
+    /// How many axes a tile folds.
     #[inline]
     pub(super) fn axes(self) -> usize {
         match self {
-            Self::Six => 6,
-            Self::Four => 4,
-            Self::Cubic => 2,
-            Self::Other(axes) => axes.into(),
+            Self::Six(_) => 6,
+            Self::Four(_) => 4,
+            Self::Cubic(_) => 2,
+            Self::Other(axes, _) => axes.into(),
         }
     }
-}
 
-/// Folds all axes: `radices` and `v` of every axis, the first one slowest; `coefficients` have shape
-/// `[outputs, radices…]`, the first axis slowest, `outputs` shape `[outputs]`. With `tiles` the number of
-/// tiles of one output, at least 1 and at most [`MAX_TILES`].
-#[inline(always)]
-pub(super) fn contract(
-    tile: Tile,
-    tiles: usize,
-    radices: impl DoubleEndedIterator<Item = usize> + ExactSizeIterator + Clone,
-    v: &[i32],
-    coefficients: &[i32],
-    outputs: &mut [i32],
-    room: &mut [i32; MAX_TILES],
-) {
-    if tiles == 1 {
-        tile_by_tile(tile, radices, v, coefficients, outputs);
-    } else {
-        contract_tiles(tile, tiles, radices, v, coefficients, outputs, room);
+    /// All coefficients.
+    pub(super) fn coefficients(self) -> &'a [i32] {
+        match self {
+            Self::Six(tiles) => tiles.as_flattened(),
+            Self::Four(tiles) | Self::Cubic(tiles) => tiles.as_flattened(),
+            Self::Other(_, coefficients) => coefficients,
+        }
     }
-}
 
-#[inline(never)]
-fn contract_tiles(
-    tile: Tile,
-    tiles: usize,
-    radices: impl DoubleEndedIterator<Item = usize> + ExactSizeIterator + Clone,
-    v: &[i32],
-    coefficients: &[i32],
-    outputs: &mut [i32],
-    room: &mut [i32; MAX_TILES],
-) {
-    // As many outputs at once as there is room for.
-    let rows = MAX_TILES.checked_div(tiles).unwrap_or(1).max(1);
-    let size = coefficients.len().checked_div(outputs.len()).unwrap_or(0);
-    let groups = coefficients.chunks(size.wrapping_mul(rows).max(1));
-    for (outputs, coefficients) in outputs.chunks_mut(rows).zip(groups) {
-        let mut len = outputs.len().wrapping_mul(tiles);
-        let folded = room.get_mut(..len).unwrap_or_default();
-        tile_by_tile(tile, radices.clone(), v, coefficients, folded);
-        let cells = Cell::from_mut(folded).as_slice_of_cells();
-        for (radix, v) in radices.clone().zip(v).rev().skip(tile.axes()) {
-            // In place: what is written has been read.
-            let groups = cells.get(..len).unwrap_or(&[]).chunks_exact(radix.max(1));
-            len = groups.len();
-            for (to, group) in cells.iter().zip(groups) {
-                let mut group = group.iter().rev();
-                let last = group.next().map_or(0, Cell::get);
-                to.set(group.fold(last, |hi, lo| fold(lo.get(), *v, hi)));
+    /// Without the first `outputs` outputs, of so many tiles each.
+    fn skip(self, outputs: usize, tiles: usize, size: usize) -> Self {
+        let skipped = outputs.wrapping_mul(tiles);
+        match self {
+            Self::Six(all) => Self::Six(all.get(skipped..).unwrap_or(&[])),
+            Self::Four(all) => Self::Four(all.get(skipped..).unwrap_or(&[])),
+            Self::Cubic(all) => Self::Cubic(all.get(skipped..).unwrap_or(&[])),
+            Self::Other(axes, all) => {
+                Self::Other(axes, all.get(skipped.wrapping_mul(size)..).unwrap_or(&[]))
             }
         }
-        for (output, folded) in outputs.iter_mut().zip(cells) {
-            *output = folded.get();
+    }
+
+    /// Folds all axes: `radices` and `v` of every axis, the first one slowest; the coefficients have shape
+    /// `[outputs, radices…]`, the first axis slowest, `outputs` shape `[outputs]`. With the number of
+    /// tiles of one output, at least 1 and at most [`MAX_TILES`].
+    #[inline(never)]
+    pub(super) fn contract(
+        self,
+        tiles: usize,
+        radices: impl DoubleEndedIterator<Item = usize> + ExactSizeIterator + Clone,
+        v: &[i32],
+        outputs: &mut [i32],
+        room: &mut [i32; MAX_TILES],
+    ) {
+        if tiles == 1 {
+            return self.fold(radices, v, outputs);
+        }
+        let axes = radices.clone().zip(v).rev();
+        let size = axes.clone().take(self.axes()).fold(1, |size: usize, (r, _)| size.wrapping_mul(r));
+        // As many outputs at once as there is room for.
+        let rows = MAX_TILES.checked_div(tiles).unwrap_or(1).max(1);
+        let mut rest = self;
+        for outputs in outputs.chunks_mut(rows) {
+            let mut len = outputs.len().wrapping_mul(tiles);
+            rest.fold(radices.clone(), v, room.get_mut(..len).unwrap_or_default());
+            rest = rest.skip(outputs.len(), tiles, size);
+            for (radix, v) in axes.clone().skip(self.axes()) {
+                len = level(radix, *v, room.get_mut(..len).unwrap_or_default());
+            }
+            for (output, folded) in outputs.iter_mut().zip(&*room) {
+                *output = *folded;
+            }
+        }
+    }
+
+    /// Folds the fastest axes: as many tiles as there are numbers in `out`.
+    #[inline(always)]
+    fn fold(
+        self,
+        radices: impl DoubleEndedIterator<Item = usize> + ExactSizeIterator + Clone,
+        v: &[i32],
+        out: &mut [i32],
+    ) {
+        match (self, v) {
+            (Self::Six(all), [.., a, b, c, d, e, f]) => six(&[*a, *b, *c, *d, *e, *f], all, out),
+            (Self::Four(all), [.., a, b, c, d]) => tiles::four(&[*a, *b, *c, *d], all, out),
+            (Self::Cubic(all), [.., a, b]) => tiles::cubic(&[*a, *b], all, out),
+            _ => other(radices.zip(v).rev().take(self.axes()), self.coefficients(), out),
         }
     }
 }
 
-/// Folds the fastest axes: as many tiles as there are numbers in `out`.
+/// Six axes of two: as many tiles as there are numbers in `out`.
 #[inline(always)]
-fn tile_by_tile(
-    tile: Tile,
-    radices: impl DoubleEndedIterator<Item = usize> + ExactSizeIterator + Clone,
-    v: &[i32],
-    coefficients: &[i32],
-    out: &mut [i32],
-) {
-    match tile {
-        Tile::Six => tiles::six(v, coefficients, out),
-        Tile::Four => tiles::four(v, coefficients, out),
-        Tile::Cubic => tiles::cubic(v, coefficients, out),
-        Tile::Other(_) => other(tile, radices, v, coefficients, out),
-    }
+pub(super) fn six(v: &[i32; 6], all: &[[i32; 64]], out: &mut [i32]) {
+    tiles::six(v, all, out);
 }
 
-/// Tiles of any shape.
+/// Folds an axis that is the fastest now, in place; how many numbers that leaves.
+#[inline(always)]
+fn level(radix: usize, v: i32, numbers: &mut [i32]) -> usize {
+    // What is written has been read.
+    let cells = Cell::from_mut(numbers).as_slice_of_cells();
+    if radix == 2 {
+        let (pairs, _) = cells.as_chunks();
+        for (to, [lo, hi]) in cells.iter().zip(pairs) {
+            to.set(fold(lo.get(), v, hi.get()));
+        }
+        return pairs.len();
+    }
+    let groups = cells.chunks_exact(radix.max(1));
+    let count = groups.len();
+    for (to, group) in cells.iter().zip(groups) {
+        let mut group = group.iter().rev();
+        let last = group.next().map_or(0, Cell::get);
+        to.set(group.fold(last, |hi, lo| fold(lo.get(), v, hi)));
+    }
+    count
+}
+
+/// Tiles of any shape, of these axes, the fastest first.
 #[inline(never)]
-fn other(
-    tile: Tile,
-    radices: impl DoubleEndedIterator<Item = usize> + ExactSizeIterator + Clone,
-    v: &[i32],
+fn other<'v>(
+    axes: impl Iterator<Item = (usize, &'v i32)> + Clone,
     coefficients: &[i32],
     out: &mut [i32],
 ) {
-    let axes = radices.zip(v).rev().take(tile.axes());
     let size = axes.clone().fold(1_usize, |size, (radix, _)| size.wrapping_mul(radix)).max(1);
     for (out, coefficients) in out.iter_mut().zip(coefficients.chunks_exact(size)) {
         let mut room = [0; AT_ONCE];
         for (to, c) in room.iter_mut().zip(coefficients) {
             *to = *c;
         }
-        let cells = Cell::from_mut(&mut room[..]).as_slice_of_cells();
         let mut len = size;
         for (radix, v) in axes.clone() {
-            let groups = cells.get(..len).unwrap_or(&[]).chunks_exact(radix.max(1));
-            len = groups.len();
-            for (to, group) in cells.iter().zip(groups) {
-                let mut group = group.iter().rev();
-                let last = group.next().map_or(0, Cell::get);
-                to.set(group.fold(last, |hi, lo| fold(lo.get(), *v, hi)));
-            }
+            len = level(radix, *v, room.get_mut(..len).unwrap_or_default());
         }
-        *out = cells.first().map_or(0, Cell::get);
+        let [folded, ..] = room;
+        *out = folded;
     }
 }
 
@@ -246,28 +267,27 @@ mod tiles {
     }
 
     #[inline(always)]
-    fn all<T: Tensor + bytemuck::AnyBitPattern, const AXES: usize>(
-        v: &[i32],
-        coefficients: &[i32],
+    fn all<T: Tensor + bytemuck::AnyBitPattern, const AXES: usize, const SIZE: usize>(
+        v: &[i32; AXES],
+        tiles: &[[i32; SIZE]],
         out: &mut [i32],
     ) {
-        let v: [i32; AXES] = v.last_chunk().copied().unwrap_or([0; AXES]);
-        let tensors: &[T] = bytemuck::try_cast_slice(coefficients).unwrap_or(&[]);
+        let tensors: &[T] = bytemuck::try_cast_slice(tiles.as_flattened()).unwrap_or(&[]);
         for (out, tensor) in out.iter_mut().zip(tensors) {
-            *out = tensor.fold(&v);
+            *out = tensor.fold(v);
         }
     }
 
-    pub(super) fn six(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
-        all::<[[[[[[i32; 2]; 2]; 2]; 2]; 2]; 2], 6>(v, coefficients, out);
+    pub(super) fn six(v: &[i32; 6], tiles: &[[i32; 64]], out: &mut [i32]) {
+        all::<[[[[[[i32; 2]; 2]; 2]; 2]; 2]; 2], 6, 64>(v, tiles, out);
     }
 
-    pub(super) fn four(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
-        all::<[[[[i32; 2]; 2]; 2]; 2], 4>(v, coefficients, out);
+    pub(super) fn four(v: &[i32; 4], tiles: &[[i32; 16]], out: &mut [i32]) {
+        all::<[[[[i32; 2]; 2]; 2]; 2], 4, 16>(v, tiles, out);
     }
 
-    pub(super) fn cubic(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
-        all::<[[i32; 4]; 4], 2>(v, coefficients, out);
+    pub(super) fn cubic(v: &[i32; 2], tiles: &[[i32; 16]], out: &mut [i32]) {
+        all::<[[i32; 4]; 4], 2, 16>(v, tiles, out);
     }
 }
 

@@ -8,17 +8,51 @@
 
 use core::arch::naked_asm;
 
-/// `lo + ⌊v · hi / 2³²⌋` in `lo`; destroys `hi` and lr.
+/// `lo + ⌊v · hi / 2³²⌋` in `lo`, or in the register before it; a Cortex-M3 destroys `hi` and lr.
 #[cfg(q31_kernel = "smmla")]
 macro_rules! fold {
     ($lo:literal, $v:literal, $hi:literal) => {
-        concat!("smmla ", $lo, ", ", $v, ", ", $hi, ", ", $lo, "\n")
+        fold!($lo, $lo, $v, $hi)
+    };
+    ($to:literal, $lo:literal, $v:literal, $hi:literal) => {
+        concat!("smmla ", $to, ", ", $v, ", ", $hi, ", ", $lo, "\n")
     };
 }
 #[cfg(q31_kernel = "smull")]
 macro_rules! fold {
     ($lo:literal, $v:literal, $hi:literal) => {
-        concat!("smull ", $hi, ", lr, ", $v, ", ", $hi, "\nadd ", $lo, ", ", $lo, ", lr\n")
+        fold!($lo, $lo, $v, $hi)
+    };
+    ($to:literal, $lo:literal, $v:literal, $hi:literal) => {
+        concat!("smull ", $hi, ", lr, ", $v, ", ", $hi, "\nadd ", $to, ", ", $lo, ", lr\n")
+    };
+}
+
+/// Sixteen coefficients, and what the second of six axes is multiplied with, which they are.
+#[cfg(q31_kernel = "smmla")]
+macro_rules! keep {
+    () => {
+        sixteen!("lr")
+    };
+}
+#[cfg(q31_kernel = "smull")]
+macro_rules! keep {
+    () => {
+        concat!(sixteen!("r7"), "str r7, [sp, #4]\n")
+    };
+}
+
+/// Sixteen coefficients, and the second of six axes, to r7.
+#[cfg(q31_kernel = "smmla")]
+macro_rules! second {
+    () => {
+        concat!(sixteen!("r7"), "ldr r8, [sp]\n", fold!("r7", "r8", "lr"))
+    };
+}
+#[cfg(q31_kernel = "smull")]
+macro_rules! second {
+    () => {
+        concat!(sixteen!("r7"), "ldrd r8, r9, [sp]\n", fold!("r7", "r8", "r9"))
     };
 }
 
@@ -34,9 +68,9 @@ macro_rules! quad {
     };
 }
 
-/// Four axes of two: the sixteen numbers before r0 to r7.
+/// Four axes of two: the sixteen numbers before r0 to a register.
 macro_rules! sixteen {
-    () => {
+    ($to:literal) => {
         concat!(
             quad!("r7", "r8", "r9", "r10"),
             quad!("r8", "r9", "r10", "r11"),
@@ -44,7 +78,7 @@ macro_rules! sixteen {
             quad!("r9", "r10", "r11", "r12"),
             quad!("r7", "r10", "r11", "r12"),
             fold!("r7", "r4", "r9"),
-            fold!("r7", "r3", "r8"),
+            fold!($to, "r7", "r3", "r8"),
         )
     };
 }
@@ -69,7 +103,8 @@ macro_rules! next {
 }
 
 /// Six axes of two.
-pub(super) fn six(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
+#[inline(always)]
+pub(super) fn six(v: &[i32; 6], tiles: &[[i32; 64]], out: &mut [i32]) {
     #[unsafe(naked)]
     unsafe extern "C" fn all(_: *const i32, _: *mut i32, _: *mut i32, _: &[i32; 6]) {
         naked_asm!(concat!(
@@ -82,17 +117,11 @@ pub(super) fn six(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
             "adds r3, #8\n",
             "ldm r3, {{r3, r4, r5, r6}}\n",
             "2:\n",
-            sixteen!(),
-            "str r7, [sp, #4]\n",
-            sixteen!(),
-            "ldrd r8, r9, [sp]\n",
-            fold!("r7", "r8", "r9"),
+            keep!(),
+            second!(),
             "str r7, [sp, #12]\n",
-            sixteen!(),
-            "str r7, [sp, #4]\n",
-            sixteen!(),
-            "ldrd r8, r9, [sp]\n",
-            fold!("r7", "r8", "r9"),
+            keep!(),
+            second!(),
             "ldrd r8, r9, [sp, #8]\n",
             fold!("r7", "r8", "r9"),
             next!(),
@@ -100,38 +129,42 @@ pub(super) fn six(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
             "pop {{r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
         ))
     }
-    let Some(v) = v.last_chunk() else { return };
-    if coefficients.len() == out.len().wrapping_mul(64) && !out.is_empty() {
-        let (from, to) = (coefficients.as_ptr_range(), out.as_mut_ptr_range());
+    if let Some(tiles) = tiles.get(..out.len())
+        && !out.is_empty()
+    {
+        let (from, to) = (tiles.as_ptr_range(), out.as_mut_ptr_range());
         // SAFETY: reads 64 numbers before `from.end` for every number before `to.end` that it writes,
-        // until the first one is written; there is at least one.
-        unsafe { all(from.end, to.end, to.start, v) }
+        // until the first one is written; there is at least one, and there are as many tiles.
+        unsafe { all(from.end.cast(), to.end, to.start, v) }
     }
 }
 
 /// Four axes of two.
-pub(super) fn four(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
+#[inline(always)]
+pub(super) fn four(v: &[i32; 4], tiles: &[[i32; 16]], out: &mut [i32]) {
     #[unsafe(naked)]
     unsafe extern "C" fn all(_: *const i32, _: *mut i32, _: *mut i32, _: &[i32; 4]) {
         naked_asm!(concat!(
             "push {{r4, r5, r6, r7, r8, r9, r10, r11, lr}}\n",
             "ldm r3, {{r3, r4, r5, r6}}\n",
             "2:\n",
-            sixteen!(),
+            sixteen!("r7"),
             next!(),
             "pop {{r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
         ))
     }
-    let Some(v) = v.last_chunk() else { return };
-    if coefficients.len() == out.len().wrapping_mul(16) && !out.is_empty() {
-        let (from, to) = (coefficients.as_ptr_range(), out.as_mut_ptr_range());
+    if let Some(tiles) = tiles.get(..out.len())
+        && !out.is_empty()
+    {
+        let (from, to) = (tiles.as_ptr_range(), out.as_mut_ptr_range());
         // SAFETY: as for six axes, with 16 numbers.
-        unsafe { all(from.end, to.end, to.start, v) }
+        unsafe { all(from.end.cast(), to.end, to.start, v) }
     }
 }
 
 /// Two axes of four.
-pub(super) fn cubic(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
+#[inline(always)]
+pub(super) fn cubic(v: &[i32; 2], tiles: &[[i32; 16]], out: &mut [i32]) {
     #[unsafe(naked)]
     unsafe extern "C" fn all(_: *const i32, _: *mut i32, _: *mut i32, _: &[i32; 2]) {
         naked_asm!(concat!(
@@ -149,10 +182,11 @@ pub(super) fn cubic(v: &[i32], coefficients: &[i32], out: &mut [i32]) {
             "pop {{r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
         ))
     }
-    let Some(v) = v.last_chunk() else { return };
-    if coefficients.len() == out.len().wrapping_mul(16) && !out.is_empty() {
-        let (from, to) = (coefficients.as_ptr_range(), out.as_mut_ptr_range());
+    if let Some(tiles) = tiles.get(..out.len())
+        && !out.is_empty()
+    {
+        let (from, to) = (tiles.as_ptr_range(), out.as_mut_ptr_range());
         // SAFETY: as for four axes of two.
-        unsafe { all(from.end, to.end, to.start, v) }
+        unsafe { all(from.end.cast(), to.end, to.start, v) }
     }
 }
