@@ -261,8 +261,6 @@ struct Plan<'a> {
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Pose {
-    x: u8,
-    y: u8,
     heading: u8,
     /// Which outputs are the changes of x and y.
     ahead: u8,
@@ -487,7 +485,6 @@ impl<'a> FixedModel<'a> {
             return Err(PredictError::NotReady { have: 0, need: 1 });
         }
         expect("inputs", self.inputs.len(), input.len())?;
-        let step = state.step.wrapping_add(1);
         let [a, b] = &mut state.banks;
         let (from, to) = if state.present { (b, a) } else { (a, b) };
         let mut outside = state.outside;
@@ -503,8 +500,9 @@ impl<'a> FixedModel<'a> {
             _ => self.operate(from, &mut state.outputs, &mut state.scratch),
         }
         let Some(next_outside) = self.retract(from, to, &state.outputs) else {
-            return Err(PredictError::Diverged { step });
+            return Err(PredictError::Diverged { step: state.step.wrapping_add(1) });
         };
+        let step = state.step.wrapping_add(1);
         if outside < 0 && state.out_of_range.is_none() {
             let observable = self.first_outside(from);
             state.out_of_range = observable.map(|observable| OutOfRange { step, observable });
@@ -538,49 +536,44 @@ impl<'a> FixedModel<'a> {
     /// there is none.
     #[inline(always)]
     fn retract(&self, from: &Bank, to: &mut Bank, outputs: &[i32; MAX_OUTPUTS]) -> Option<i32> {
-        if let Some(pose) = self.pose {
-            self.place(pose, from, to, outputs)?;
-        }
         let mut beyond_range = 0;
         for [head, registers, low, span, least, last, least_cos, last_cos, ..] in self.coordinates {
             let output = |i: i32| {
                 let index = (head >> 16).wrapping_add(i) as usize & (MAX_OUTPUTS - 1);
                 outputs.get(index).copied().unwrap_or_default()
             };
-            let (z, shift) = (output(0), shift_of(*head));
-            let kind = Kind::of(*head)?;
-            let x = match kind {
-                Kind::Next => {
-                    if outside(z, *low, *span) {
-                        return None;
-                    }
-                    let x = z.wrapping_shl(shift as u32);
-                    set(to, *registers, x);
-                    beyond_range |= beyond(x, *least, *last);
-                    continue;
+            let (z, registers) = (output(0), *registers);
+            if head & 0xFF == Kind::Next as i32 {
+                if outside(z, *low, *span) {
+                    return None;
                 }
+                let x = z << (head >> 8 & 31);
+                set(to, registers, x);
+                beyond_range |= beyond(x, *least, *last);
+                continue;
+            }
+            let (kind, shift) = (Kind::of(*head)?, shift_of(*head));
+            let x = match kind {
                 Kind::Circle => {
-                    let mut point = [0; 2];
-                    if !circle::on_circle(z, output(1), shift as u32, &mut point) {
+                    let cos = output(1);
+                    let zeros = circle::zeros(z, cos);
+                    if zeros > shift as u32 + circle::SHORTEST {
                         return None;
                     }
-                    let [sin, cos] = point;
+                    let (sin, cos) = circle::on_circle(z, cos, zeros);
                     set(to, registers >> 8, sin);
                     set(to, registers >> 16, cos);
                     beyond_range |= beyond(sin, *least, *last) | beyond(cos, *least_cos, *last_cos);
                     continue;
                 }
-                // Is there already.
-                Kind::Pose => get(to, *registers),
-                Kind::Change => change(get(from, *registers), z, shift)?,
-                Kind::Turn | Kind::Heading => {
-                    get(from, *registers).wrapping_add(shifted(z, shift))
-                }
+                Kind::Pose => self.place(*head, registers, from, outputs)?,
+                Kind::Next | Kind::Change => change(get(from, registers), z, shift)?,
+                Kind::Turn | Kind::Heading => get(from, registers).wrapping_add(shifted(z, shift)),
             };
             if outside(x, *low, *span) {
                 return None;
             }
-            set(to, *registers, x);
+            set(to, registers, x);
             if kind == Kind::Heading {
                 let (sin, cos) = circle::sin_cos(x);
                 set(to, registers >> 8, sin);
@@ -593,31 +586,30 @@ impl<'a> FixedModel<'a> {
         Some(beyond_range)
     }
 
-    /// The next x and y of a pose.
+    /// The next x or y of a pose.
     #[inline(never)]
     fn place(
         &self,
-        pose: Pose,
+        head: i32,
+        registers: i32,
         from: &Bank,
-        to: &mut Bank,
         outputs: &[i32; MAX_OUTPUTS],
-    ) -> Option<()> {
+    ) -> Option<i32> {
+        let pose = self.pose?;
         let output = |index: u8| outputs.get(usize::from(index)).copied().map(i64::from);
         let (ahead, left) = (output(pose.ahead)?, output(pose.left)?);
         let [_, heading, ..] = self.coordinates.get(usize::from(pose.heading))?;
         let (sin, cos) = (get(from, heading >> 8), get(from, heading >> 16));
         let (sin, cos) = (i64::from(sin), i64::from(cos));
         // Below 2⁶² both: the outputs are below 2³⁰.
-        let x = cos.wrapping_mul(ahead).wrapping_sub(sin.wrapping_mul(left));
-        let y = sin.wrapping_mul(ahead).wrapping_add(cos.wrapping_mul(left));
-        for (index, change) in [(pose.x, x), (pose.y, y)] {
-            let [head, registers, ..] = self.coordinates.get(usize::from(index))?;
-            let down = 31_i32.wrapping_sub(shift_of(*head)) as u32;
-            let change = change.wrapping_shr(down.wrapping_sub(1)).wrapping_add(1) >> 1;
-            let next = change.wrapping_add(get(from, *registers).into());
-            set(to, *registers, i32::try_from(next).ok()?);
-        }
-        Some(())
+        let change = if head >> 16 & 0xFF == i32::from(pose.ahead) {
+            cos.wrapping_mul(ahead).wrapping_sub(sin.wrapping_mul(left))
+        } else {
+            sin.wrapping_mul(ahead).wrapping_add(cos.wrapping_mul(left))
+        };
+        let down = 31_i32.wrapping_sub(shift_of(head)) as u32;
+        let change = change.wrapping_shr(down.wrapping_sub(1)).wrapping_add(1) >> 1;
+        i32::try_from(change.wrapping_add(get(from, registers).into())).ok()
     }
 
     /// The first observable outside its range.
@@ -878,7 +870,7 @@ impl<'a> FixedModel<'a> {
             (1, 2, Some(ahead), Some(left))
                 if head(heading).and_then(Kind::of) == Some(Kind::Heading) && head(x).map(shift_of) == head(y).map(shift_of) =>
             {
-                Some(Pose { x, y, heading, ahead, left })
+                Some(Pose { heading, ahead, left })
             }
             _ => return Err(section("pose")),
         };

@@ -40,10 +40,10 @@ const ATAN: [i32; 30] = [
     3,
     1,
 ];
-/// 1 / (2 √n) in n within [0.25, 2]: highest power first, in Q32, Q31, Q28; off by 7.4 % at most.
-const HALF_RECIPROCAL_ROOT: [i32; 3] = [1_083_731_345, -1_889_754_434, 303_424_035];
+/// 1 / (2 √n) in n within [0.25, 2): highest power first, in Q32, Q31, Q29; off by 7.4 % at most.
+const HALF_RECIPROCAL_ROOT: [i32; 3] = [1_083_731_345, -1_889_754_434, 606_848_070];
 /// How much shorter than 1 sine and cosine may be before they have lost their direction: 2⁻¹⁰.
-const SHORTEST: u32 = 10;
+pub(super) const SHORTEST: u32 = 10;
 
 /// The upper word of the product.
 #[inline(always)]
@@ -103,28 +103,29 @@ fn newton(n: u32, y: u32) -> u32 {
     ((u64::from(y) * u64::from((3_u32 << 30).wrapping_sub(product))) >> 31) as u32
 }
 
-/// Sine and cosine of scale 2^(31 − `shift`) back on the circle and in Q31, off by at most 3e-8 of their length;
-/// whether they have not lost their direction.
+/// Leading zeros of the larger one; −2ᵏ has one more than 2ᵏ.
+#[inline(always)]
+pub(super) fn zeros(sin: i32, cos: i32) -> u32 {
+    ((sin ^ (sin >> 31)) | (cos ^ (cos >> 31))).leading_zeros()
+}
+
+/// Sine and cosine of any scale back on the circle and in Q31, off by at most 3e-8 of their length; with their
+/// leading [`zeros`].
 #[inline(never)]
-pub(super) fn on_circle(sin: i32, cos: i32, shift: u32, to: &mut [i32; 2]) -> bool {
-    // Of the larger one; −2ᵏ has one more than 2ᵏ.
-    let zeros = ((sin ^ (sin >> 31)) | (cos ^ (cos >> 31))).leading_zeros();
-    if zeros > shift.wrapping_add(SHORTEST) {
-        return false;
-    }
-    // The larger one within [2³⁰, 2³¹]: the square n of the length, in Q30, is within [0.25, 2].
+pub(super) fn on_circle(sin: i32, cos: i32, zeros: u32) -> (i32, i32) {
+    // The larger one within [2³⁰, 2³¹]: the square n of the length, in Q30, is within [0.25, 2). Without the
+    // 1, which is nothing, it could be 2.
     let up = zeros.wrapping_sub(1) & 31;
     let (sin, cos) = (sin << up, cos << up);
-    let n = (high(sin, sin) as u32).wrapping_add(high(cos, cos) as u32);
-    let half = (n >> 1) as i32;
+    let square = high(sin, sin).wrapping_sub(1).wrapping_add(high(cos, cos));
     let [a, b, c] = HALF_RECIPROCAL_ROOT;
-    let guess = c.wrapping_add(high(half, b.wrapping_add(high(half, a) << 2)));
+    let guess = c.wrapping_add(high(square, b.wrapping_add(high(square, a) << 1)));
     // In Q31: y = 1 / (2 √n) by Newton's method.
-    let y = newton(n, newton(n, (guess as u32) << 3));
+    let n = square as u32;
+    let y = newton(n, newton(n, (guess as u32) << 2));
     let product = ((u64::from(n) * u64::from(high_unsigned(y, y))) >> 28) as u32;
     let y = high_unsigned(y, (3_u32 << 30).wrapping_sub(product)) as i32;
     // Half of it in Q31 is it in Q30, and products are in Q28.
     let put = |x: i32| high(x, y).clamp(-(1 << 28), (1 << 28) - 1) << 3;
-    *to = [put(sin), put(cos)];
-    true
+    (put(sin), put(cos))
 }

@@ -38,7 +38,7 @@ macro_rules! keep {
 #[cfg(q31_kernel = "smull")]
 macro_rules! keep {
     () => {
-        concat!(sixteen!("r7"), "str r7, [sp, #4]\n")
+        concat!(sixteen!("r7"), "str r7, [sp]\n")
     };
 }
 
@@ -46,13 +46,13 @@ macro_rules! keep {
 #[cfg(q31_kernel = "smmla")]
 macro_rules! second {
     () => {
-        concat!(sixteen!("r7"), "ldr r8, [sp]\n", fold!("r7", "r8", "lr"))
+        concat!(sixteen!("r7"), "ldr r8, [sp, #4]\n", fold!("r7", "r8", "lr"))
     };
 }
 #[cfg(q31_kernel = "smull")]
 macro_rules! second {
     () => {
-        concat!(sixteen!("r7"), "ldrd r8, r9, [sp]\n", fold!("r7", "r8", "r9"))
+        concat!(sixteen!("r7"), "ldrd r8, r9, [sp]\n", fold!("r7", "r9", "r8"))
     };
 }
 
@@ -108,13 +108,11 @@ pub(super) fn six(v: &[i32; 6], tiles: &[[i32; 64]], out: &mut [i32]) {
     #[unsafe(naked)]
     unsafe extern "C" fn all(_: *const i32, _: *mut i32, _: *mut i32, _: &[i32; 6]) {
         naked_asm!(concat!(
-            "push {{r4, r5, r6, r7, r8, r9, r10, r11, lr}}\n",
-            "sub sp, #16\n",
-            // On the stack: the second observable and what it is multiplied with, the same for the first.
-            "ldrd r4, r5, [r3]\n",
-            "str r4, [sp, #8]\n",
-            "str r5, [sp]\n",
-            "adds r3, #8\n",
+            // On the stack, in room that r0 to r3 make: what the second observable is multiplied with, the second
+            // observable, the first one, what it is multiplied with.
+            "push {{r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, lr}}\n",
+            "ldrd r4, r5, [r3], #8\n",
+            "strd r5, r4, [sp, #4]\n",
             "ldm r3, {{r3, r4, r5, r6}}\n",
             "2:\n",
             keep!(),
@@ -125,8 +123,7 @@ pub(super) fn six(v: &[i32; 6], tiles: &[[i32; 64]], out: &mut [i32]) {
             "ldrd r8, r9, [sp, #8]\n",
             fold!("r7", "r8", "r9"),
             next!(),
-            "add sp, #16\n",
-            "pop {{r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
+            "pop {{r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, pc}}\n",
         ))
     }
     if let Some(tiles) = tiles.get(..out.len())

@@ -12,6 +12,7 @@ use core::hint::black_box;
 
 use cortex_m_rt::entry;
 use cortex_m_semihosting::hprintln;
+use firmware_core::PredictError;
 use firmware_core::blob::Aligned;
 use firmware_core::capacity::{MAX_INPUTS, MAX_STATES};
 use firmware_core::q31::{FixedModel, FixedState, parse};
@@ -66,49 +67,58 @@ fn all() -> Option<()> {
     Some(())
 }
 
-type Work = fn(&FixedModel<'_>, &mut FixedState, &[i32]) -> bool;
+type Work<'a> = fn(&FixedModel<'a>, &mut FixedState, &[i32]) -> Result<(), PredictError>;
 
-/// Measures a step from the middle of all ranges.
+/// Measures a step from the middle of all ranges, from its first instruction to its last.
 #[inline(never)]
-fn measure(i: usize, model: &FixedModel<'_>, per_tick: f32, bytes: usize) -> Option<()> {
+fn measure<'a>(i: usize, model: &FixedModel<'a>, per_tick: f32, bytes: usize) -> Option<()> {
     let zeros = [0; MAX_STATES];
     let input = [0; MAX_INPUTS];
     let input = input.get(..model.inputs())?;
     let mut start = FixedState::new();
     model.observe(&mut start, zeros.get(..model.states())?).ok()?;
-    let mut state = start.clone();
-    let mut repeat = |work: Work| {
-        let mut good = true;
-        let ticks = count(|| {
-            for _ in 0..REPETITIONS {
-                state.clone_from(black_box(&start));
-                good &= work(model, &mut state, input);
-            }
-        });
-        (ticks, good)
-    };
-    let (with, good) = repeat(black_box(step));
-    let (reading, read) = repeat(black_box(coordinates));
-    // What `nothing` costs itself (a move and a return) goes with the call of the step.
-    let (without, _) = repeat(black_box(nothing));
-    let instructions = |with: u32| (with - without) as f32 * per_tick / REPETITIONS as f32;
-    hprintln!("# {} {:.1} {:.1} {}", i, instructions(with), instructions(reading), bytes);
+    let (with, good) = repeat(FixedModel::step, model, &start, input);
+    let (reading, read) = repeat(coordinates, model, &start, input);
+    let (without, _) = repeat(nothing, model, &start, input);
+    let per_call = |ticks: u32| (ticks - without) as f32 * per_tick / REPETITIONS as f32 + NOTHING;
+    hprintln!("# {} {:.1} {:.1} {}", i, per_call(with), per_call(reading), bytes);
     (good && read).then_some(())
 }
 
+/// Ticks of many calls, each from the same state, and whether all were well. Never inlined, so that it is the
+/// same loop for all.
 #[inline(never)]
-fn step(model: &FixedModel<'_>, state: &mut FixedState, input: &[i32]) -> bool {
-    model.step(state, input).is_ok()
+fn repeat<'a>(
+    work: Work<'a>,
+    model: &FixedModel<'a>,
+    start: &FixedState,
+    input: &[i32],
+) -> (u32, bool) {
+    let (work, mut state, mut good) = (black_box(work), start.clone(), true);
+    let ticks = count(|| {
+        for _ in 0..REPETITIONS {
+            state.clone_from(black_box(start));
+            good &= work(model, &mut state, input).is_ok();
+        }
+    });
+    (ticks, good && state.out_of_range().is_none())
 }
 
 #[inline(never)]
-fn coordinates(model: &FixedModel<'_>, state: &mut FixedState, _: &[i32]) -> bool {
+fn coordinates(
+    model: &FixedModel<'_>,
+    state: &mut FixedState,
+    _: &[i32],
+) -> Result<(), PredictError> {
     let mut out = [0; MAX_STATES];
     let out = out.get_mut(..model.states()).unwrap_or_default();
-    model.coordinates(state, out).is_ok() && black_box(out).len() == model.states()
+    model.coordinates(state, black_box(out))
 }
 
+/// Instructions of [`nothing`]: two that enter, two that store the result, and the return.
+const NOTHING: f32 = 5.0;
+
 #[inline(never)]
-fn nothing(_: &FixedModel<'_>, _: &mut FixedState, _: &[i32]) -> bool {
-    true
+fn nothing(_: &FixedModel<'_>, _: &mut FixedState, _: &[i32]) -> Result<(), PredictError> {
+    Ok(())
 }
