@@ -5,8 +5,7 @@ fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rustc-check-cfg=cfg(q31_kernel, values(none(), \"smmla\", \"smull\"))");
     let target = std::env::var("TARGET").unwrap_or_default();
-    let kernels =
-        [("thumbv7em-", "smmla"), ("thumbv7m-", "smull"), ("thumbv8m.main-", "smull")];
+    let kernels = [("thumbv7em-", "smmla"), ("thumbv7m-", "smull"), ("thumbv8m.main-", "smull")];
     for (prefix, kernel) in kernels {
         if target.starts_with(prefix) {
             println!("cargo::rustc-cfg=q31_kernel");

@@ -473,7 +473,8 @@ impl<'a> Sections<'a> {
                 return Err(bad);
             }
             if kind < OPTIONAL && !known.contains(&(kind, encoding)) {
-                let fixed_point = kinds().any(|kind| kind == Q31.0) && known.contains(&COEFFICIENTS);
+                let fixed_point =
+                    kinds().any(|kind| kind == Q31.0) && known.contains(&COEFFICIENTS);
                 return Err(match fixed_point {
                     true => ParseError::FixedPoint,
                     false => ParseError::UnknownSection { kind, encoding },
@@ -515,7 +516,10 @@ impl<'a> Sections<'a> {
     }
 
     /// The bytes of a section as whole elements, in place.
-    pub(crate) fn cast<T: bytemuck::AnyBitPattern>(&self, section: (u16, u16)) -> Result<&'a [T], ParseError> {
+    pub(crate) fn cast<T: bytemuck::AnyBitPattern>(
+        &self,
+        section: (u16, u16),
+    ) -> Result<&'a [T], ParseError> {
         let bytes = self.bytes(section)?;
         bytemuck::try_cast_slice(bytes).map_err(|_| ParseError::SectionLength {
             kind: section.0,

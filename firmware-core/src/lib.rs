@@ -54,7 +54,6 @@
         clippy::unreachable
     )
 )]
-
 // Only assembly needs it, which no other machine has.
 #![cfg_attr(not(q31_kernel), forbid(unsafe_code))]
 

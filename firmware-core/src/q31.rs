@@ -283,7 +283,9 @@ pub struct FixedModel<'a> {
 }
 
 /// All that moves while a model in fixed point predicts.
-#[derive(Clone, Debug)]
+///
+/// `clone_from` into a state that is there already takes a fraction of what `clone` takes.
+#[derive(Debug)]
 pub struct FixedState {
     /// The present sample, and where the next one is made.
     banks: [Bank; 2],
@@ -305,6 +307,21 @@ struct Scratch {
     room: [i32; MAX_TILES],
 }
 
+/// What a step has made on the way is not copied into a state that is there already.
+impl Clone for FixedState {
+    fn clone(&self) -> Self {
+        Self { scratch: self.scratch.clone(), ..*self }
+    }
+
+    fn clone_from(&mut self, other: &Self) {
+        let [a, b] = &other.banks;
+        let [present, _] = &mut self.banks;
+        *present = if other.present { *b } else { *a };
+        (self.present, self.outside, self.model) = (false, other.outside, other.model);
+        (self.step, self.out_of_range) = (other.step, other.out_of_range);
+    }
+}
+
 impl Default for FixedState {
     fn default() -> Self {
         Self {
@@ -315,10 +332,7 @@ impl Default for FixedState {
             step: 0,
             out_of_range: None,
             outputs: [0; MAX_OUTPUTS],
-            scratch: Scratch {
-                values: [0; MAX_BLOCK_FACTORS],
-                room: [0; MAX_TILES],
-            },
+            scratch: Scratch { values: [0; MAX_BLOCK_FACTORS], room: [0; MAX_TILES] },
         }
     }
 }
@@ -447,11 +461,7 @@ impl<'a> FixedModel<'a> {
     ///
     /// # Errors
     /// [`PredictError::DimensionMismatch`]; the state is unchanged.
-    pub fn observe(
-        &self,
-        state: &mut FixedState,
-        coordinates: &[i32],
-    ) -> Result<(), PredictError> {
+    pub fn observe(&self, state: &mut FixedState, coordinates: &[i32]) -> Result<(), PredictError> {
         expect("coordinates", self.coordinates.len(), coordinates.len())?;
         let (bank, _) = state.banks();
         let mut outside = 0;
@@ -616,16 +626,19 @@ impl<'a> FixedModel<'a> {
     #[cold]
     #[inline(never)]
     fn first_outside(&self, bank: &Bank) -> Option<usize> {
-        let inputs = self.inputs.iter().map(|[head, low, high, ..]| (*head, *low, *high, head >> 8));
-        let states = self.coordinates.iter().flat_map(|[head, registers, _, _, low, high, last @ ..]| {
-            let [least_cos, last_cos, ..] = last;
-            let angle = matches!(Kind::of(*head), Some(Kind::Circle | Kind::Heading));
-            let first = if angle { registers >> 8 } else { *registers };
-            let cos = (registers >> 16, *least_cos, *last_cos, registers >> 24);
-            [Some((first, *low, *high, head >> 24)), angle.then_some(cos)].into_iter().flatten()
-        });
+        let inputs =
+            self.inputs.iter().map(|[head, low, high, ..]| (*head, *low, *high, head >> 8));
+        let states =
+            self.coordinates.iter().flat_map(|[head, registers, _, _, low, high, last @ ..]| {
+                let [least_cos, last_cos, ..] = last;
+                let angle = matches!(Kind::of(*head), Some(Kind::Circle | Kind::Heading));
+                let first = if angle { registers >> 8 } else { *registers };
+                let cos = (registers >> 16, *least_cos, *last_cos, registers >> 24);
+                [Some((first, *low, *high, head >> 24)), angle.then_some(cos)].into_iter().flatten()
+            });
         let mut all = states.chain(inputs);
-        let found = all.find(|(register, low, high, _)| beyond(get(bank, *register), *low, *high) < 0);
+        let found =
+            all.find(|(register, low, high, _)| beyond(get(bank, *register), *low, *high) < 0);
         found.map(|(.., observable)| (observable & 0xFF) as usize)
     }
 
@@ -668,6 +681,26 @@ impl<'a> FixedModel<'a> {
         let mut rows = inputs.chunks_exact(m.max(1));
         for out in predicted.chunks_exact_mut(n) {
             self.step(state, rows.next().unwrap_or(&[]))?;
+            self.coordinates(state, out)?;
+        }
+        Ok(())
+    }
+
+    /// The same with one input, shape `[inputs]`, held over the whole horizon.
+    ///
+    /// # Errors
+    /// As [`rollout`](Self::rollout).
+    pub fn rollout_held(
+        &self,
+        state: &mut FixedState,
+        input: &[i32],
+        predicted: &mut [i32],
+    ) -> Result<(), PredictError> {
+        let n = self.coordinates.len().max(1);
+        let horizon = predicted.len().checked_div(n).unwrap_or(0);
+        expect("predicted", horizon.saturating_mul(n), predicted.len())?;
+        for out in predicted.chunks_exact_mut(n) {
+            self.step(state, input)?;
             self.coordinates(state, out)?;
         }
         Ok(())
@@ -868,7 +901,8 @@ impl<'a> FixedModel<'a> {
         self.pose = match (there, poses, ahead, left) {
             (0, 0, ..) if pose == 0 => None,
             (1, 2, Some(ahead), Some(left))
-                if head(heading).and_then(Kind::of) == Some(Kind::Heading) && head(x).map(shift_of) == head(y).map(shift_of) =>
+                if head(heading).and_then(Kind::of) == Some(Kind::Heading)
+                    && head(x).map(shift_of) == head(y).map(shift_of) =>
             {
                 Some(Pose { heading, ahead, left })
             }

@@ -45,6 +45,8 @@
 //! # Ok::<(), firmware_sim::drive::DriveError>(())
 //! ```
 
+#![forbid(unsafe_code)]
+
 pub mod arm;
 pub mod bench;
 pub mod drive;

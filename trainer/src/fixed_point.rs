@@ -16,7 +16,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
-use crate::report::{grouped, significant};
+use crate::report::{grouped, hexadecimal, significant};
 use crate::robot::ScoreOptions;
 use crate::terms::Names;
 use crate::trajectory::Trajectory;
@@ -81,7 +81,9 @@ pub enum FixedError {
         state: String,
     },
     /// A name that is not there.
-    #[error("--full-scale {name}: there is no such coordinate on R and no such input; there are {known}")]
+    #[error(
+        "--full-scale {name}: there is no such coordinate on R and no such input; there are {known}"
+    )]
     UnknownName {
         /// The name.
         name: String,
@@ -89,7 +91,9 @@ pub enum FixedError {
         known: String,
     },
     /// A scale that cannot be.
-    #[error("--full-scale {name}={value}: expected a number above 0 that holds the trained range, {least} or more")]
+    #[error(
+        "--full-scale {name}={value}: expected a number above 0 that holds the trained range, {least} or more"
+    )]
     TooSmall {
         /// The name.
         name: String,
@@ -173,7 +177,8 @@ impl Scales {
         options: &FixedOptions,
     ) -> Result<Self, FixedError> {
         let range_of = |source: Source| {
-            let observables = structure.dictionary().observables().iter().zip(ranges.as_chunks::<2>().0);
+            let observables =
+                structure.dictionary().observables().iter().zip(ranges.as_chunks::<2>().0);
             let mut found = observables.filter(|(o, _)| o.source == source);
             found.next().map(|(_, range)| range.map(f64::from))
         };
@@ -227,7 +232,8 @@ impl Scales {
                 (None, None) => line(least, most),
             });
         }
-        if let Some((name, _)) = options.full_scales.iter().find(|(n, _)| !known.contains(&n.as_str()))
+        if let Some((name, _)) =
+            options.full_scales.iter().find(|(n, _)| !known.contains(&n.as_str()))
         {
             let (name, known) = (name.clone(), known.join(", "));
             return Err(FixedError::UnknownName { name, known });
@@ -257,9 +263,7 @@ fn harmonics(order: usize) -> Vec<Vec<f64>> {
     one[0] = 1.0;
     // sin nφ = s · Uₙ₋₁(c), cos nφ = Tₙ(c), both with Pₙ₊₁ = 2 c Pₙ − Pₙ₋₁.
     let next = |current: &[f64], previous: &[f64]| -> Vec<f64> {
-        (0..radix)
-            .map(|i| if i > 0 { 2.0 * current[i - 1] } else { 0.0 } - previous[i])
-            .collect()
+        (0..radix).map(|i| if i > 0 { 2.0 * current[i - 1] } else { 0.0 } - previous[i]).collect()
     };
     let unit = |i: usize| (0..radix).map(|j| if i == j { 1.0 } else { 0.0 }).collect::<Vec<f64>>();
     let (mut u, mut u_before) = (unit(0), vec![0.0; radix]);
@@ -361,9 +365,7 @@ impl FixedBlock {
                 continue;
             }
             let (range, (centre, full)) = match scale {
-                Some(scale) => {
-                    (range(index).map(|x| scale.to_fixed(f64::from(x))), parts(scale))
-                }
+                Some(scale) => (range(index).map(|x| scale.to_fixed(f64::from(x))), parts(scale)),
                 None => (circle(index), (0.0, 1.0)),
             };
             let gain = f64::from(observable.gain);
@@ -446,8 +448,8 @@ pub struct FixedCoordinate {
     pub full_scale: f64,
     /// What the last place of the output stands for, as a share of full scale.
     pub resolution: f64,
-    /// The largest sum of the equation that is possible, as a share of what fits.
-    pub bound: f64,
+    /// The largest sum of the equation that is possible, as a share of what fits, if that was reckoned.
+    pub bound: Option<f64>,
 }
 
 /// What became of an input.
@@ -495,8 +497,7 @@ pub fn fixed_point(
     for (_, factors) in structure.dictionary().blocks() {
         let size = block_size(factors);
         let rows = model.coefficients().chunks_exact(structure.dictionary().dense_terms());
-        let rows =
-            rows.map(|row| row[first..first + size].iter().map(|c| f64::from(*c)).collect());
+        let rows = rows.map(|row| row[first..first + size].iter().map(|c| f64::from(*c)).collect());
         blocks.push(FixedBlock::new(structure, factors, rows.collect(), &scales, ranges));
         first += size;
     }
@@ -537,7 +538,7 @@ pub fn fixed_point(
             centre,
             full_scale,
             resolution: 2_f64.powi(exponent - 31),
-            bound: f64::from(bound) / ONE,
+            bound: Some(f64::from(bound) / ONE),
         });
         output += if *kind == Kind::Circle { 2 } else { 1 };
     }
@@ -705,7 +706,8 @@ impl Words {
     ) -> Result<Self, FixedError> {
         let axes = blocks.iter().flat_map(|block| &block.axes);
         let factors = axes.clone().count();
-        let room = [("blocks", blocks.len(), q31::MAX_BLOCKS), ("factors", factors, q31::MAX_FACTORS)];
+        let room =
+            [("blocks", blocks.len(), q31::MAX_BLOCKS), ("factors", factors, q31::MAX_FACTORS)];
         if let Some((field, found, capacity)) = room.into_iter().find(|(_, n, most)| n > most) {
             return Err(LoadError::TooLarge { field, capacity, found }.into());
         }
@@ -753,7 +755,8 @@ impl Words {
     /// The trained range of something without its last bit, or everything.
     fn range(&self, source: Source) -> [u32; 2] {
         let found = self.registers.iter().find(|(kept, _)| *kept == source);
-        let range = found.and_then(|(_, axis)| *axis).map_or([i32::MIN, i32::MAX], |axis| axis.range);
+        let range =
+            found.and_then(|(_, axis)| *axis).map_or([i32::MIN, i32::MAX], |axis| axis.range);
         range.map(|x| (x >> 1) as u32)
     }
 
@@ -818,6 +821,114 @@ impl Words {
 fn scale_up(scale: Scale, limit: f32) -> i32 {
     let (centre, full) = parts(scale);
     ((f64::from(limit) - centre) / full * ONE).round() as i32
+}
+
+/// A blob in fixed point, described.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct FixedInspection {
+    /// Robot name.
+    pub robot: String,
+    /// Sample time \[s\].
+    pub sample_time_s: f32,
+    /// Coordinates, without the bound, which only the exporter knows.
+    pub coordinates: Vec<FixedCoordinate>,
+    /// Inputs.
+    pub inputs: Vec<FixedInput>,
+    /// Coefficients of all outputs.
+    pub coefficients: usize,
+    /// Bytes of the blob.
+    pub bytes: usize,
+    /// SHA-256 of the logs.
+    pub logs_sha256: String,
+    /// SHA-256 of the robot description.
+    pub robot_sha256: String,
+}
+
+/// Describes a blob in fixed point.
+///
+/// # Errors
+/// [`LoadError`].
+pub fn inspect(bytes: &[u8]) -> Result<FixedInspection, LoadError> {
+    let (model, structure) = (q31::parse(bytes)?, q31::structure(bytes)?);
+    let coordinates = structure.states().iter().zip(model.coordinates_of());
+    let inputs = structure.inputs().iter().zip((0..).map_while(|i| model.input_scale(i)));
+    Ok(FixedInspection {
+        robot: structure.robot().to_owned(),
+        sample_time_s: structure.sample_time_s(),
+        coordinates: coordinates
+            .map(|(state, (_, shift, scale))| {
+                let (centre, full_scale) = parts(scale);
+                FixedCoordinate {
+                    name: state.name.to_owned(),
+                    unit: state.unit.to_owned(),
+                    centre,
+                    full_scale,
+                    resolution: 2_f64.powi(shift - 31),
+                    bound: None,
+                }
+            })
+            .collect(),
+        inputs: inputs
+            .map(|(input, scale)| {
+                let (centre, full_scale) = parts(scale);
+                FixedInput {
+                    name: input.name.to_owned(),
+                    unit: input.unit.to_owned(),
+                    centre,
+                    full_scale,
+                }
+            })
+            .collect(),
+        coefficients: model.coefficients().map(<[i32]>::len).sum(),
+        bytes: bytes.len(),
+        logs_sha256: hexadecimal(&structure.provenance().logs),
+        robot_sha256: hexadecimal(&structure.provenance().robot),
+    })
+}
+
+impl FixedInspection {
+    /// As text.
+    pub fn text(&self) -> String {
+        format!(
+            "robot        {}\nsample time  {} s\nnumbers      32-bit integers of the scales below (fixed point)\n\n{}\n\
+             {} bytes, {} of them coefficients\nlogs         sha256 {}\nrobot.toml   sha256 {}\n",
+            self.robot,
+            self.sample_time_s,
+            scales(&self.coordinates, &self.inputs),
+            grouped(self.bytes as u64),
+            grouped(4 * self.coefficients as u64),
+            self.logs_sha256,
+            self.robot_sha256
+        )
+    }
+}
+
+/// The scales of coordinates and inputs, a line each.
+fn scales(coordinates: &[FixedCoordinate], inputs: &[FixedInput]) -> String {
+    let mut text = format!(
+        "{:26} {:>12} {:>11}  last place of the output  largest sum\n",
+        "", "centre", "full scale"
+    );
+    for c in coordinates {
+        let bound = c.bound.map(|bound| format!("  {:>10} %", significant(100.0 * bound)));
+        text += &format!(
+            "  {:<24} {:>12} {:>11}  {:>24}{}\n",
+            format!("{} [{}]", c.name, c.unit),
+            significant(c.centre),
+            significant(c.full_scale),
+            significant(c.resolution * c.full_scale),
+            bound.unwrap_or_default(),
+        );
+    }
+    for input in inputs {
+        text += &format!(
+            "  {:<24} {:>12} {:>11}\n",
+            format!("{} [{}]", input.name, input.unit),
+            significant(input.centre),
+            significant(input.full_scale),
+        );
+    }
+    text
 }
 
 /// Errors of a coordinate in its unit.
@@ -963,7 +1074,9 @@ pub fn compare(model: &Model<'_>, fixed: &FixedModel<'_>) -> Result<OneStep, Fix
             .collect();
         let u: Vec<f64> = (0_u8..)
             .zip(structure.inputs())
-            .map(|(i, input)| between(range(Source::Input(i)).unwrap_or(input.range.map(f64::from))))
+            .map(|(i, input)| {
+                between(range(Source::Input(i)).unwrap_or(input.range.map(f64::from)))
+            })
             .collect();
         // From one sample: what the controller is given.
         let mut state = FixedState::new();
@@ -1056,28 +1169,10 @@ pub fn compare_on_logs(
 /// Scales, bounds and differences, as text.
 pub fn text(export: &FixedExport, one_step: &OneStep, logs: Option<&OnLogs>) -> String {
     let mut text = format!(
-        "{} coefficients in 32 bits; nothing overflows, whatever the observables are\n\n\
-         coordinate, unit                centre  full scale  last place of the output  largest sum\n",
-        grouped(export.coefficients as u64)
+        "{} coefficients in 32 bits; nothing overflows, whatever the observables are\n\n{}",
+        grouped(export.coefficients as u64),
+        scales(&export.coordinates, &export.inputs)
     );
-    for c in &export.coordinates {
-        text += &format!(
-            "  {:<24} {:>12} {:>11}  {:>24}  {:>10} %\n",
-            format!("{} [{}]", c.name, c.unit),
-            significant(c.centre),
-            significant(c.full_scale),
-            significant(c.resolution * c.full_scale),
-            significant(100.0 * c.bound),
-        );
-    }
-    for input in &export.inputs {
-        text += &format!(
-            "  {:<24} {:>12} {:>11}\n",
-            format!("{} [{}]", input.name, input.unit),
-            significant(input.centre),
-            significant(input.full_scale),
-        );
-    }
     text += &format!(
         "\none step from {} random samples within the trained range, against f64",
         grouped(one_step.samples as u64)
@@ -1085,7 +1180,8 @@ pub fn text(export: &FixedExport, one_step: &OneStep, logs: Option<&OnLogs>) -> 
     if one_step.diverged > 0 {
         text += &format!(" ({} more diverge)", grouped(one_step.diverged as u64));
     }
-    text += ":\n                             largest, over full scale          rms   f32: largest\n";
+    text +=
+        ":\n                             largest, over full scale          rms   f32: largest\n";
     for ((c, fixed), float) in export.coordinates.iter().zip(&one_step.fixed).zip(&one_step.float) {
         text += &format!(
             "  {:<24} {:>11}  {:>14} {:>12} {:>14}\n",

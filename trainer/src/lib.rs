@@ -25,6 +25,8 @@
 //! | [`signing`] | keys, and signed releases of models |
 //! | [`resample`] | logs on a regular time grid |
 
+#![forbid(unsafe_code)]
+
 pub mod arx;
 pub mod chain;
 pub mod conformal;

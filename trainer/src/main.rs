@@ -20,7 +20,8 @@ use trainer::edmd;
 use trainer::export::{controller_coefficients, export, write_whole};
 use trainer::figures;
 use trainer::fixed_point::{
-    self, FixedCoordinate, FixedError, FixedInput, FixedOptions, OnLogs, OneStep, fixed_point,
+    self, FixedCoordinate, FixedError, FixedInput, FixedInspection, FixedOptions, OnLogs, OneStep,
+    fixed_point,
 };
 use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
@@ -1177,7 +1178,10 @@ struct InspectReport<'i> {
 
 fn show_blob(args: &InspectArgs) -> Result<(), Failure> {
     let file = BlobFile::read(&args.model)?;
-    let inspection = inspect(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let inspection = match inspect(file.bytes()) {
+        Err(blob::ParseError::FixedPoint) => return show_fixed_point(args, file.bytes()),
+        inspection => inspection.map_err(|e| refused(&args.model, e))?,
+    };
     if args.json {
         return print_json(&InspectReport {
             format: 1,
@@ -1209,7 +1213,11 @@ fn export_model(args: &ExportArgs) -> Result<(), Failure> {
     let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
     let test = blob::self_test(file.bytes()).map_err(|e| refused(&args.model, e))?;
     if args.out.extension().is_some_and(|e| e == "toml" || e == "csv")
-        || args.out.canonicalize().ok().is_some_and(|out| args.model.canonicalize().ok() == Some(out))
+        || args
+            .out
+            .canonicalize()
+            .ok()
+            .is_some_and(|out| args.model.canonicalize().ok() == Some(out))
     {
         let out = args.out.display();
         return Err(Failure(format!(
@@ -1221,7 +1229,8 @@ fn export_model(args: &ExportArgs) -> Result<(), Failure> {
     }
     let mut options = FixedOptions { margin: args.margin, full_scales: Vec::new() };
     for given in &args.full_scale {
-        let value = given.split_once('=').and_then(|(name, v)| Some((name, v.trim().parse().ok()?)));
+        let value =
+            given.split_once('=').and_then(|(name, v)| Some((name, v.trim().parse().ok()?)));
         let (name, value) = value.ok_or_else(|| {
             format!("--full-scale {given}: expected NAME=VALUE, such as x=10, in the unit of x")
         })?;
@@ -1271,6 +1280,26 @@ fn export_model(args: &ExportArgs) -> Result<(), Failure> {
         grouped(export.bytes.len() as u64),
         fixed_point::text(&export, &one_step, logs.as_ref())
     ))
+}
+
+/// `inspect --json` of a blob in fixed point.
+#[derive(Serialize)]
+struct InspectFixedReport<'i> {
+    format: u32,
+    command: &'static str,
+    fixed_point: &'i FixedInspection,
+}
+
+fn show_fixed_point(args: &InspectArgs, bytes: &[u8]) -> Result<(), Failure> {
+    let inspection = fixed_point::inspect(bytes).map_err(|e| match e {
+        q31::LoadError::Blob(error) => refused(&args.model, error),
+        other => Failure(format!("{}: {other:?}", args.model.display())),
+    })?;
+    if args.json {
+        let (format, command) = (1, "inspect");
+        return print_json(&InspectFixedReport { format, command, fixed_point: &inspection });
+    }
+    print(&inspection.text())
 }
 
 /// `spectrum --json`.

@@ -130,7 +130,8 @@ impl<'a> Tiles<'a> {
             return self.fold(radices, v, outputs);
         }
         let axes = radices.clone().zip(v).rev();
-        let size = axes.clone().take(self.axes()).fold(1, |size: usize, (r, _)| size.wrapping_mul(r));
+        let size =
+            axes.clone().take(self.axes()).fold(1, |size: usize, (r, _)| size.wrapping_mul(r));
         // As many outputs at once as there is room for.
         let rows = MAX_TILES.checked_div(tiles).unwrap_or(1).max(1);
         let mut rest = self;

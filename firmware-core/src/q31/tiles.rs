@@ -4,7 +4,10 @@
 //! In all functions r0 is behind the coefficients that are not folded yet, r1 behind the results that are
 //! not there yet, and r2 the place of the first result: from the last one to the first. Observables
 //! stay in r3 to r6, the fastest last, and numbers on the way are in r7 to r12; lr is scratch.
-#![allow(unsafe_code, reason = "functions in assembly, and the calls with pointers and lengths checked")]
+#![allow(
+    unsafe_code,
+    reason = "functions in assembly, and the calls with pointers and lengths checked"
+)]
 
 use core::arch::naked_asm;
 
@@ -60,7 +63,15 @@ macro_rules! second {
 macro_rules! quad {
     ($a:literal, $b:literal, $c:literal, $d:literal) => {
         concat!(
-            "ldmdb r0!, {{", $a, ", ", $b, ", ", $c, ", ", $d, "}}\n",
+            "ldmdb r0!, {{",
+            $a,
+            ", ",
+            $b,
+            ", ",
+            $c,
+            ", ",
+            $d,
+            "}}\n",
             fold!($a, "r6", $b),
             fold!($c, "r6", $d),
             fold!($a, "r5", $c),
@@ -87,7 +98,15 @@ macro_rules! sixteen {
 macro_rules! four {
     ($a:literal, $b:literal, $c:literal, $d:literal) => {
         concat!(
-            "ldmdb r0!, {{", $a, ", ", $b, ", ", $c, ", ", $d, "}}\n",
+            "ldmdb r0!, {{",
+            $a,
+            ", ",
+            $b,
+            ", ",
+            $c,
+            ", ",
+            $d,
+            "}}\n",
             fold!($c, "r6", $d),
             fold!($b, "r6", $c),
             fold!($a, "r6", $b),
