@@ -473,8 +473,8 @@ impl<'a> Sections<'a> {
                 return Err(bad);
             }
             if kind < OPTIONAL && !known.contains(&(kind, encoding)) {
-                let fixed_point =
-                    kinds().any(|kind| kind == Q31.0) && known.contains(&COEFFICIENTS);
+                let q31 = |e: &[u8; ENTRY]| (read_u16(e, 0), read_u16(e, 2)) == Q31;
+                let fixed_point = known.contains(&COEFFICIENTS) && table.iter().any(q31);
                 return Err(match fixed_point {
                     true => ParseError::FixedPoint,
                     false => ParseError::UnknownSection { kind, encoding },
