@@ -41,7 +41,7 @@
 //!
 //! # The section 0x0005
 //!
-//! 32-bit words, little-endian; the [blob](crate::blob) has no coefficients in f32 then.
+//! 32-bit words, little-endian; the [blob] has no coefficients in f32 then.
 //!
 //! | words | what |
 //! |---|---|
@@ -824,9 +824,12 @@ impl<'a> FixedModel<'a> {
                 take(cos, true)?;
             }
             let nowhere = |register: u8| usize::from(register) == NOWHERE;
-            if (kind == Kind::Circle && !nowhere(value))
-                || (!circle && !(nowhere(sin) && nowhere(cos)))
-            {
+            let fits = match kind {
+                Kind::Circle => nowhere(value),
+                Kind::Heading => true,
+                _ => nowhere(sin) && nowhere(cos),
+            };
+            if !fits {
                 return Err(section);
             }
         }

@@ -40,6 +40,9 @@ fn structure(inputs: usize) -> Structure<'static> {
     .unwrap()
 }
 
+/// Room for a blob.
+type Slot = Aligned<[u8; 65_536]>;
+
 fn bytes(bytes: [u8; 4]) -> u32 {
     u32::from_le_bytes(bytes)
 }
@@ -66,11 +69,7 @@ fn words(radices: &[u8], shift: u8, coefficients: &[i32]) -> Vec<u32> {
     words
 }
 
-fn emit(
-    inputs: usize,
-    words: &[u32],
-    test: &[i32],
-) -> Result<Box<Aligned<[u8; 65_536]>>, LoadError> {
+fn emit(inputs: usize, words: &[u32], test: &[i32]) -> Result<Box<Slot>, LoadError> {
     let mut blob = Box::new(Aligned([0xFF; 65_536]));
     q31::emit(&structure(inputs), words, test, &mut blob.0)?;
     Ok(blob)
@@ -199,7 +198,7 @@ fn golden_bytes() {
 }
 
 /// A slot with a blob of these sections.
-fn slot(parts: &[Section]) -> Box<Aligned<[u8; 65_536]>> {
+fn slot(parts: &[Section]) -> Box<Slot> {
     let mut slot = Box::new(Aligned([0xFF; 65_536]));
     let blob = assemble(parts);
     slot.0[..blob.len()].copy_from_slice(&blob);
@@ -295,7 +294,7 @@ fn in_f64(radices: &[u8], coefficients: &[i32], v: &[i32]) -> f64 {
 }
 
 /// The largest coefficients in these proportions that are accepted.
-fn largest(radices: &[u8], proportions: &[i32]) -> Option<(Vec<i32>, Box<Aligned<[u8; 65_536]>>)> {
+fn largest(radices: &[u8], proportions: &[i32]) -> Option<(Vec<i32>, Box<Slot>)> {
     let test = vec![0; radices.len()];
     (0..31).find_map(|shift| {
         let coefficients: Vec<i32> = proportions.iter().map(|c| c >> shift).collect();
