@@ -22,11 +22,11 @@
 //!
 //! | kind | section | encoding | status |
 //! |---|---|---|---|
-//! | 0x0001 | metadata: [`ModelRepr`] | 1: postcard 1 | required |
+//! | 0x0001 | metadata: [`ModelRepr`](crate::ModelRepr) | 1: postcard 1 | required |
 //! | 0x0002 | coefficients `[outputs, dense_terms]`, of a sparse model `[outputs, T + 1]` | 2: f32, powers of the observables | required |
-//! | 0x0003 | self-test, below | 3: f32 | required |
+//! | 0x0003 | self-test, below; of a model in fixed point as [`q31`](crate::q31) says | 3: f32; 7: i32 | required |
 //! | 0x0004 | terms of a sparse model, below: `[T, 2]` | 4: u8 | makes the model sparse |
-//! | 0x0005 | coefficients in Q31 | | reserved |
+//! | 0x0005 | scales, ranges and coefficients of a model in fixed point: [`q31`](crate::q31) | 6: 32-bit words | instead of 0x0002 |
 //! | 0x8001 | trained ranges `[observables, 2]`: smallest, largest raw value | 3: f32 | optional |
 //! | 0x8002 | error bounds, below | 5: u32 and f32 | optional |
 //! | 0x8003 | signature | | reserved |
@@ -35,6 +35,9 @@
 //! `[L + 1, states]`; the inputs at the same samples, shape `[L + 1, inputs]`; the expected
 //! coordinates at k + 1 and the tolerance of each, shape `[states]` both. The model is refused
 //! unless it predicts within the tolerance, a finite one (angles compared on the circle).
+//!
+//! A blob in fixed point has the sections 0x0001, 0x0003 and 0x0005 and is read by
+//! [`q31::parse`](crate::q31::parse); [`parse`] refuses it as [`ParseError::FixedPoint`].
 //!
 //! A blob without terms is a dense model: every term of every block of the metadata has its
 //! coefficients. In one with terms ([`sparse`](crate::sparse)) every block is a single factor, not
@@ -59,13 +62,12 @@
 //! enumerations as a varint of the variant in the order of the declaration, `f32` as four bytes,
 //! text and lists with their length first.
 
-use crc::{CRC_32_ISO_HDLC, Crc};
-use serde::Deserialize;
-
 use crate::Scalar;
 use crate::capacity::MAX_STATES;
+use crate::dictionary::DictionaryError;
+use crate::encoding::ReadError;
 use crate::error_bounds::{ErrorBounds, ErrorBoundsError};
-use crate::model::{Model, ModelError, ModelRepr, Structure};
+use crate::model::{Model, ModelError, Structure};
 use crate::predictor::{PredictError, Predictor, PredictorState};
 use crate::sparse::SparseTerms;
 
@@ -80,14 +82,49 @@ const HEADER: usize = 16;
 const ENTRY: usize = 12;
 /// Kinds from here on may be skipped.
 const OPTIONAL: u16 = 0x8000;
-const METADATA: (u16, u16) = (0x0001, 1);
+pub(crate) const METADATA: (u16, u16) = (0x0001, 1);
 const COEFFICIENTS: (u16, u16) = (0x0002, 2);
+pub(crate) const COEFFICIENTS_KIND: u16 = COEFFICIENTS.0;
 const SELF_TEST: (u16, u16) = (0x0003, 3);
 const TERMS: (u16, u16) = (0x0004, 4);
+pub(crate) const Q31: (u16, u16) = (0x0005, 6);
+pub(crate) const Q31_SELF_TEST: (u16, u16) = (0x0003, 7);
 const RANGES: (u16, u16) = (0x8001, 3);
 const ERROR_BOUNDS: (u16, u16) = (0x8002, 5);
 
-pub(crate) const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+/// What a byte does to the CRC-32 (ISO-HDLC: polynomial 0x04C11DB7, reflected).
+static BYTES: [u32; 256] = {
+    let mut bytes = [0; 256];
+    let mut rest: &mut [u32] = &mut bytes;
+    let mut byte = 0;
+    while let Some((first, others)) = rest.split_first_mut() {
+        let (mut crc, mut bit) = (byte, 0);
+        while bit < 8 {
+            crc = (crc >> 1) ^ if crc & 1 == 1 { 0xEDB8_8320 } else { 0 };
+            bit += 1;
+        }
+        *first = crc;
+        byte += 1;
+        rest = others;
+    }
+    bytes
+};
+
+/// CRC-32 (ISO-HDLC) of bytes that follow others with the checksum `before`; that of nothing is 0.
+///
+/// A word at a time: four instructions a byte on a Cortex-M, a quarter of them to fetch the bytes.
+pub(crate) fn crc32(before: u32, bytes: &[u8]) -> u32 {
+    let next = |crc: u32| {
+        let [index, ..] = crc.to_le_bytes();
+        // Never out of bounds: there are as many as bytes.
+        (crc >> 8) ^ BYTES.get(usize::from(index)).copied().unwrap_or(0)
+    };
+    let (words, rest) = bytes.as_chunks::<4>();
+    let whole = words
+        .iter()
+        .fold(!before, |crc, word| next(next(next(next(crc ^ u32::from_le_bytes(*word))))));
+    !rest.iter().fold(whole, |crc, byte| next(crc ^ u32::from(*byte)))
+}
 
 /// Puts bytes at an address divisible by four, as a blob needs them.
 ///
@@ -136,6 +173,8 @@ pub enum ParseError {
     },
     /// The section table does not hold together.
     SectionTable,
+    /// It is a model in fixed point: [`q31::parse`](crate::q31::parse) reads it.
+    FixedPoint,
     /// A section that has to be understood is not known to this code.
     UnknownSection {
         /// Its kind.
@@ -175,9 +214,24 @@ pub enum ParseError {
     AnotherRobot,
 }
 
+impl From<ReadError> for ParseError {
+    fn from(error: ReadError) -> Self {
+        match error {
+            ReadError::Malformed => Self::Metadata,
+            ReadError::Unsupported => Self::Unsupported,
+        }
+    }
+}
+
 impl From<ModelError> for ParseError {
     fn from(error: ModelError) -> Self {
         Self::Model(error)
+    }
+}
+
+impl From<DictionaryError> for ParseError {
+    fn from(error: DictionaryError) -> Self {
+        Self::Model(ModelError::Dictionary(error))
     }
 }
 
@@ -230,26 +284,37 @@ impl<'a> SelfTest<'a> {
     /// # Errors
     /// As [`Predictor::step`].
     pub fn predict(&self, model: &Model<'_>, out: &mut [f32]) -> Result<(), PredictError> {
+        self.predict_in(model, &mut PredictorState::new(), out)
+    }
+
+    /// The same in a state that has seen nothing of this model.
+    fn predict_in(
+        &self,
+        model: &Model<'_>,
+        state: &mut PredictorState,
+        out: &mut [f32],
+    ) -> Result<(), PredictError> {
         let structure = model.structure();
         let m = structure.inputs().len();
         let predictor = Predictor::new(model);
-        let mut state = PredictorState::new();
+        state.clear();
         let mut inputs = self.inputs.chunks_exact(m.max(1));
         let mut applied: &[f32] = &[];
         for states in self.states.chunks_exact(structure.states().len().max(1)) {
-            predictor.observe(&mut state, applied, states)?;
+            predictor.observe(state, applied, states)?;
             applied = inputs.next().unwrap_or(&[]);
         }
-        predictor.step(&mut state, applied)?;
-        predictor.coordinates(&state, out)
+        predictor.step(state, applied)?;
+        predictor.coordinates(state, out)
     }
 
     /// The first coordinate that the model does not predict within the tolerance.
-    fn failure(&self, model: &Model<'_>) -> Option<usize> {
+    #[inline(never)]
+    fn failure(&self, model: &Model<'_>, state: &mut PredictorState) -> Option<usize> {
         let states = model.structure().states();
         let mut predicted = [0.0; MAX_STATES];
         let predicted = predicted.get_mut(..states.len())?;
-        if self.predict(model, predicted).is_err() {
+        if self.predict_in(model, state, predicted).is_err() {
             return Some(states.len());
         }
         let expected = self.expected.iter().zip(self.tolerance);
@@ -266,11 +331,7 @@ impl<'a> SelfTest<'a> {
 /// # Errors
 /// [`ParseError`] names the first thing that is wrong.
 pub fn parse(bytes: &[u8]) -> Result<Model<'_>, ParseError> {
-    let expected = length(bytes)?;
-    if bytes.len() > expected {
-        return Err(ParseError::Trailing { expected, found: bytes.len() });
-    }
-    parse_prefix(bytes)
+    returned(bytes, Extent::Exact)
 }
 
 /// [`parse`], refusing the model of another robot.
@@ -290,81 +351,187 @@ pub fn parse_for<'a>(robot: &str, bytes: &'a [u8]) -> Result<Model<'a>, ParseErr
 /// # Errors
 /// As [`parse`].
 pub fn parse_prefix(slot: &[u8]) -> Result<Model<'_>, ParseError> {
-    if !slot.as_ptr().addr().is_multiple_of(4) {
-        return Err(ParseError::Misaligned);
-    }
-    let total = length(slot)?;
-    let truncated = ParseError::Truncated { expected: total, found: slot.len() };
-    let blob = slot.get(..total).ok_or(truncated)?;
-    let (expected, found) = (read_u32(blob, 12), checksum(blob));
-    if expected != found {
-        return Err(ParseError::Checksum { expected, found });
-    }
-    match Sections::new(blob) {
-        Ok(sections) => read_model(&sections),
-        Err(error) => Err(error),
-    }
+    returned(slot, Extent::Prefix)
 }
 
-// A model is kilobytes, and so are the parts that it is made of. Below, every part is made in a frame of
-// its own, which is off the stack when the next one begins, and results are passed on as they are: what
-// is unwrapped and wrapped again is there twice.
+/// Which of the bytes are the blob.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Extent {
+    /// All.
+    Exact,
+    /// Those at the beginning.
+    Prefix,
+}
 
-/// The model of a blob whose sections are there.
 #[inline(never)]
-fn read_model<'a>(sections: &Sections<'a>) -> Result<Model<'a>, ParseError> {
-    match read_structure(sections) {
-        Ok(structure) => {
-            let coefficients = sections.numbers(COEFFICIENTS)?;
-            let ranges = present(sections.numbers(RANGES))?;
-            let terms = present(sections.terms())?;
-            Model::join(structure, terms, coefficients, ranges, |model| complete(model, sections))
-        }
-        Err(error) => Err(error),
+fn returned(bytes: &[u8], extent: Extent) -> Result<Model<'_>, ParseError> {
+    // The model is made where the result is returned, and not moved there.
+    let mut parsed = Ok(Model::empty());
+    if let Ok(model) = &mut parsed
+        && let Err(error) = load_alone(bytes, extent, model)
+    {
+        parsed = Err(error);
     }
+    parsed
 }
 
-/// The metadata, checked.
+/// [`parse`] into a model that is there already, with a state to try the stored prediction in: what
+/// takes the least stack. The state is a new one afterwards, and of bytes that are refused the model is
+/// [empty](Model::empty).
+///
+/// # Errors
+/// As [`parse`].
+pub fn parse_into<'a>(
+    bytes: &'a [u8],
+    model: &mut Model<'a>,
+    state: &mut PredictorState,
+) -> Result<(), ParseError> {
+    load(bytes, Extent::Exact, model, state)
+}
+
+/// The same with a state of its own.
 #[inline(never)]
-fn read_structure<'a>(sections: &Sections<'a>) -> Result<Structure<'a>, ParseError> {
-    let mut reader = postcard::Deserializer::from_bytes(sections.bytes(METADATA)?);
-    match read_metadata(&mut reader) {
-        Ok(repr) => match reader.finalize() {
-            Ok([]) => Structure::check(repr),
-            _ => Err(ParseError::Metadata),
-        },
-        // What serde and heapless refuse although the bytes are postcard.
-        Err(postcard::Error::SerdeDeCustom) => Err(ParseError::Unsupported),
-        Err(_) => Err(ParseError::Metadata),
+fn load_alone<'a>(
+    bytes: &'a [u8],
+    extent: Extent,
+    model: &mut Model<'a>,
+) -> Result<(), ParseError> {
+    load(bytes, extent, model, &mut PredictorState::new())
+}
+
+// What is made below is made where it belongs, and nothing that is large is passed by value: a model is
+// kilobytes. Every part has a frame of its own, which is off the stack when the next one begins.
+
+/// Loads a blob. (`?` would copy every error on its way.)
+#[inline(always)]
+fn load<'a>(
+    bytes: &'a [u8],
+    extent: Extent,
+    model: &mut Model<'a>,
+    state: &mut PredictorState,
+) -> Result<(), ParseError> {
+    let mut sections = Sections { blob: &[], table: &[] };
+    let mut loaded = whole(bytes, extent, &mut sections);
+    if loaded.is_ok() {
+        loaded = match sections.bytes(METADATA) {
+            Some(bytes) => model.structure_mut().read(bytes).map_err(ParseError::from),
+            None => Err(ParseError::MissingSection { kind: METADATA.0 }),
+        };
     }
+    if loaded.is_ok() {
+        loaded = model.structure_mut().check();
+    }
+    if loaded.is_ok() {
+        model.structure_mut().lay_out();
+        loaded = take_terms(&sections, model);
+    }
+    if loaded.is_ok() {
+        loaded = model.lay_out();
+    }
+    if loaded.is_ok() {
+        model.shorten();
+        loaded = take_numbers(&sections, model);
+    }
+    if loaded.is_ok() {
+        loaded = take_error_bounds(&sections, model);
+    }
+    if loaded.is_ok() {
+        loaded = try_prediction(&sections, model, state);
+    }
+    if loaded.is_err() {
+        model.clear();
+    }
+    state.clear();
+    loaded
 }
 
-/// The metadata as they are.
+/// Terms, once it is clear that the sections of all numbers can be read.
 #[inline(never)]
-fn read_metadata<'a>(
-    reader: &mut postcard::Deserializer<'a, postcard::de_flavors::Slice<'a>>,
-) -> postcard::Result<ModelRepr<'a>> {
-    ModelRepr::deserialize(reader)
+fn take_terms<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
+    sections.required::<f32>(COEFFICIENTS)?;
+    sections.optional::<f32>(RANGES)?;
+    let terms = sections.optional(TERMS)?;
+    model.take_terms(terms).map_err(|error| ModelError::Sparse(error).into())
 }
 
-/// Gives the model its error bounds, if it has any, and tries the stored prediction.
 #[inline(never)]
-fn complete<'a>(model: &mut Model<'a>, sections: &Sections<'a>) -> Result<(), ParseError> {
-    if let Some(words) = present(sections.words(ERROR_BOUNDS))? {
+fn take_numbers<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
+    let (coefficients, ranges) = (sections.required(COEFFICIENTS)?, sections.optional(RANGES)?);
+    Ok(model.take_numbers(coefficients, ranges)?)
+}
+
+/// Error bounds, if there are any.
+#[inline(never)]
+fn take_error_bounds<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
+    if let Some(words) = sections.optional(ERROR_BOUNDS)? {
         let bounds = error_bounds(model.structure().states().len(), words)?;
-        model.set_error_bounds(bounds).map_err(ParseError::Model)?;
+        model.set_error_bounds(bounds)?;
     }
-    let numbers = sections.numbers(SELF_TEST)?;
+    Ok(())
+}
+
+/// Tries the stored prediction.
+#[inline(never)]
+fn try_prediction(
+    sections: &Sections<'_>,
+    model: &Model<'_>,
+    state: &mut PredictorState,
+) -> Result<(), ParseError> {
+    let numbers = sections.required(SELF_TEST)?;
     let wrong = ParseError::SectionLength {
         kind: SELF_TEST.0,
         expected: SelfTest::len(model.structure()).saturating_mul(4),
         found: numbers.len().saturating_mul(4),
     };
     let self_test = SelfTest::split(model.structure(), numbers).ok_or(wrong)?;
-    match self_test.failure(model) {
+    match self_test.failure(model, state) {
         None => Ok(()),
         Some(coordinate) => Err(ParseError::SelfTest { coordinate }),
     }
+}
+
+/// The sections of a blob whose checksum and section table hold.
+#[inline(never)]
+fn whole<'a>(
+    slot: &'a [u8],
+    extent: Extent,
+    sections: &mut Sections<'a>,
+) -> Result<(), ParseError> {
+    *sections = Sections::new(checked(slot, extent)?.0)?;
+    Ok(())
+}
+
+/// The blob, and its checksum, which holds.
+#[inline]
+pub(crate) fn checked(slot: &[u8], extent: Extent) -> Result<(&[u8], u32), ParseError> {
+    let is_aligned = slot.as_ptr().addr().is_multiple_of(4);
+    if extent == Extent::Prefix && !is_aligned {
+        return Err(ParseError::Misaligned);
+    }
+    let total = length(slot)?;
+    if extent == Extent::Exact && slot.len() > total {
+        return Err(ParseError::Trailing { expected: total, found: slot.len() });
+    }
+    if !is_aligned {
+        return Err(ParseError::Misaligned);
+    }
+    let truncated = ParseError::Truncated { expected: total, found: slot.len() };
+    let blob = slot.get(..total).ok_or(truncated)?;
+    let (expected, found) = (read_u32(blob, 12), checksum(blob));
+    if expected != found {
+        return Err(ParseError::Checksum { expected, found });
+    }
+    Ok((blob, found))
+}
+
+/// The metadata of a blob whose sections are there, checked.
+pub(crate) fn read_structure<'a>(sections: &Sections<'a>) -> Result<Structure<'a>, ParseError> {
+    let missing = ParseError::MissingSection { kind: METADATA.0 };
+    let mut structure = Structure::empty();
+    structure.read(sections.bytes(METADATA).ok_or(missing)?)?;
+    structure.check::<ParseError>()?;
+    structure.lay_out();
+    Ok(structure)
 }
 
 /// The prediction stored in a blob that [`parse`] accepts.
@@ -373,7 +540,7 @@ fn complete<'a>(model: &mut Model<'a>, sections: &Sections<'a>) -> Result<(), Pa
 /// As [`parse`].
 pub fn self_test(bytes: &[u8]) -> Result<SelfTest<'_>, ParseError> {
     let model = parse(bytes)?;
-    let numbers = Sections::new(bytes)?.numbers(SELF_TEST)?;
+    let numbers = Sections::new(bytes)?.required(SELF_TEST)?;
     SelfTest::split(model.structure(), numbers)
         .ok_or(ParseError::MissingSection { kind: SELF_TEST.0 })
 }
@@ -416,10 +583,8 @@ pub fn length(bytes: &[u8]) -> Result<usize, ParseError> {
 }
 
 fn checksum(blob: &[u8]) -> u32 {
-    let mut digest = CRC.digest();
-    digest.update(blob.get(..12).unwrap_or(&[]));
-    digest.update(blob.get(HEADER..).unwrap_or(&[]));
-    digest.finalize()
+    let head = crc32(0, blob.get(..12).unwrap_or(&[]));
+    crc32(head, blob.get(HEADER..).unwrap_or(&[]))
 }
 
 fn read_u16(bytes: &[u8], offset: usize) -> u16 {
@@ -433,13 +598,18 @@ fn read_u32(bytes: &[u8], offset: usize) -> u32 {
 }
 
 /// The section table of a blob whose checksum holds, checked.
-struct Sections<'a> {
+pub(crate) struct Sections<'a> {
     blob: &'a [u8],
     table: &'a [[u8; ENTRY]],
 }
 
 impl<'a> Sections<'a> {
     fn new(blob: &'a [u8]) -> Result<Self, ParseError> {
+        Self::of(blob, &[METADATA, COEFFICIENTS, SELF_TEST, TERMS])
+    }
+
+    /// Of a reader that understands these kinds in these encodings.
+    pub(crate) fn of(blob: &'a [u8], known: &[(u16, u16)]) -> Result<Self, ParseError> {
         let bad = ParseError::SectionTable;
         let count = usize::from(read_u16(blob, 6));
         if count > MAX_SECTIONS {
@@ -453,9 +623,13 @@ impl<'a> Sections<'a> {
             if kinds().take(i).any(|earlier| earlier == kind) {
                 return Err(bad);
             }
-            let known = [METADATA, COEFFICIENTS, SELF_TEST, TERMS].contains(&(kind, encoding));
-            if kind < OPTIONAL && !known {
-                return Err(ParseError::UnknownSection { kind, encoding });
+            if kind < OPTIONAL && !known.contains(&(kind, encoding)) {
+                let q31 = |e: &[u8; ENTRY]| (read_u16(e, 0), read_u16(e, 2)) == Q31;
+                let fixed_point = known.contains(&COEFFICIENTS) && table.iter().any(q31);
+                return Err(match fixed_point {
+                    true => ParseError::FixedPoint,
+                    false => ParseError::UnknownSection { kind, encoding },
+                });
             }
             // Every byte of a blob belongs to one section or is padding of zeros.
             let (offset, length) = (read_u32(entry, 4), read_u32(entry, 8));
@@ -471,44 +645,43 @@ impl<'a> Sections<'a> {
     }
 
     /// The bytes of a section; one of another encoding counts as missing.
-    fn bytes(&self, section: (u16, u16)) -> Result<&'a [u8], ParseError> {
-        let missing = ParseError::MissingSection { kind: section.0 };
+    #[inline(never)]
+    pub(crate) fn bytes(&self, (kind, encoding): (u16, u16)) -> Option<&'a [u8]> {
         let mut table = self.table.iter();
-        let entry = table.find(|e| (read_u16(*e, 0), read_u16(*e, 2)) == section).ok_or(missing)?;
+        let entry = table.find(|e| (read_u16(*e, 0), read_u16(*e, 2)) == (kind, encoding))?;
         let offset = usize::try_from(read_u32(entry, 4)).unwrap_or(usize::MAX);
         let length = usize::try_from(read_u32(entry, 8)).unwrap_or(usize::MAX);
-        self.blob.get(offset..offset.saturating_add(length)).ok_or(ParseError::SectionTable)
+        self.blob.get(offset..offset.saturating_add(length))
     }
 
-    fn numbers(&self, section: (u16, u16)) -> Result<&'a [f32], ParseError> {
-        self.cast(section)
+    /// A section as whole elements, in place, if there is one.
+    #[inline]
+    fn optional<T: bytemuck::AnyBitPattern>(
+        &self,
+        section: (u16, u16),
+    ) -> Result<Option<&'a [T]>, ParseError> {
+        self.bytes(section).map(|bytes| elements(section.0, bytes)).transpose()
     }
 
-    fn words(&self, section: (u16, u16)) -> Result<&'a [u32], ParseError> {
-        self.cast(section)
-    }
-
-    fn terms(&self) -> Result<&'a [[u8; 2]], ParseError> {
-        self.cast(TERMS)
-    }
-
-    /// The bytes of a section as whole elements, in place.
-    fn cast<T: bytemuck::AnyBitPattern>(&self, section: (u16, u16)) -> Result<&'a [T], ParseError> {
-        let bytes = self.bytes(section)?;
-        bytemuck::try_cast_slice(bytes).map_err(|_| ParseError::SectionLength {
-            kind: section.0,
-            expected: bytes.len().next_multiple_of(size_of::<T>()),
-            found: bytes.len(),
-        })
+    /// A section that has to be there.
+    #[inline]
+    pub(crate) fn required<T: bytemuck::AnyBitPattern>(
+        &self,
+        section: (u16, u16),
+    ) -> Result<&'a [T], ParseError> {
+        match self.bytes(section) {
+            Some(bytes) => elements(section.0, bytes),
+            None => Err(ParseError::MissingSection { kind: section.0 }),
+        }
     }
 }
 
-/// Leaves a section that may be missing to the reader.
-fn present<T>(section: Result<T, ParseError>) -> Result<Option<T>, ParseError> {
-    match section {
-        Err(ParseError::MissingSection { .. }) => Ok(None),
-        other => other.map(Some),
-    }
+/// The bytes of a section as whole elements, in place.
+#[inline]
+fn elements<T: bytemuck::AnyBitPattern>(kind: u16, bytes: &[u8]) -> Result<&[T], ParseError> {
+    let (expected, found) = (bytes.len().next_multiple_of(size_of::<T>()), bytes.len());
+    let wrong = |_| ParseError::SectionLength { kind, expected, found };
+    bytemuck::try_cast_slice(bytes).map_err(wrong)
 }
 
 /// Cuts the section of the error bounds into its parts.
@@ -561,12 +734,7 @@ pub fn emit(
     let optional =
         [model.terms().is_some(), model.ranges().is_some(), model.error_bounds().is_some()];
     let count = optional.into_iter().fold(3_usize, |n, there| n.saturating_add(there.into()));
-    let table = HEADER.saturating_add(count.saturating_mul(ENTRY));
-    let mut writer = Writer { out, entry: HEADER, end: table };
-    let repr = structure.to_repr();
-    let metadata = writer.out.get_mut(table..).ok_or(short)?;
-    let length = postcard::to_slice(&repr, metadata).map_err(|_| short)?.len();
-    writer.close(METADATA, length).ok_or(short)?;
+    let mut writer = Writer::new(out, count, structure)?;
     writer.numbers(COEFFICIENTS, &[model.coefficients()]).ok_or(short)?;
     writer.numbers(SELF_TEST, &self_test).ok_or(short)?;
     if let Some(terms) = model.terms() {
@@ -583,16 +751,7 @@ pub fn emit(
         let words = words.chain(bounds.bounds().iter().map(|bound| bound.to_bits()));
         writer.words(ERROR_BOUNDS, words.map(u32::to_le_bytes)).ok_or(short)?;
     }
-    let end = writer.end;
-    let blob = out.get_mut(..end).ok_or(short)?;
-    let length = u32::try_from(end).map_err(|_| short)?;
-    write(blob, 0, &MAGIC);
-    write(blob, 4, &VERSION.to_le_bytes());
-    write(blob, 6, &(count as u16).to_le_bytes());
-    write(blob, 8, &length.to_le_bytes());
-    let checksum = checksum(blob);
-    write(blob, 12, &checksum.to_le_bytes());
-    Ok(end)
+    writer.seal()
 }
 
 /// The length in bytes of the blob that [`emit`] writes for a model of this structure, dense or with
@@ -621,13 +780,54 @@ pub fn size(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>, ranges: b
 }
 
 /// Lays sections one after the other and fills in the table.
-struct Writer<'a> {
+pub(crate) struct Writer<'a> {
     out: &'a mut [u8],
     entry: usize,
     end: usize,
 }
 
-impl Writer<'_> {
+impl<'a> Writer<'a> {
+    /// Begins a blob of so many sections with the metadata.
+    pub(crate) fn new(
+        out: &'a mut [u8],
+        sections: usize,
+        structure: &Structure<'_>,
+    ) -> Result<Self, EmitError> {
+        let short = EmitError::BufferTooShort { found: out.len() };
+        let table = HEADER.saturating_add(sections.saturating_mul(ENTRY));
+        let mut writer = Self { out, entry: HEADER, end: table };
+        let metadata = writer.out.get_mut(table..).ok_or(short)?;
+        let length = postcard::to_slice(&structure.to_repr(), metadata).map_err(|_| short)?.len();
+        writer.close(METADATA, length).ok_or(short)?;
+        Ok(writer)
+    }
+
+    /// A section of words.
+    pub(crate) fn put(
+        &mut self,
+        section: (u16, u16),
+        words: impl Iterator<Item = [u8; 4]>,
+    ) -> Result<(), EmitError> {
+        let short = EmitError::BufferTooShort { found: self.out.len() };
+        self.words(section, words).ok_or(short)
+    }
+
+    /// Ends the blob, whose sections are all there: its length.
+    pub(crate) fn seal(self) -> Result<usize, EmitError> {
+        let short = EmitError::BufferTooShort { found: self.out.len() };
+        let blob = self.out.get_mut(..self.end).ok_or(short)?;
+        let length = u32::try_from(self.end).map_err(|_| short)?;
+        // At most MAX_SECTIONS.
+        let count = self.entry.saturating_sub(HEADER).checked_div(ENTRY).unwrap_or(0) as u16;
+        write(blob, 0, &MAGIC);
+        write(blob, 4, &VERSION.to_le_bytes());
+        write(blob, 6, &count.to_le_bytes());
+        write(blob, 8, &length.to_le_bytes());
+        let checksum = checksum(blob);
+        write(blob, 12, &checksum.to_le_bytes());
+        Ok(self.end)
+    }
+
     /// Ends the section of `length` bytes that was written at `end`: table entry and padding.
     fn close(&mut self, (kind, encoding): (u16, u16), length: usize) -> Option<()> {
         let padded = self.end.checked_add(length)?.checked_next_multiple_of(4)?;
@@ -665,5 +865,27 @@ impl Writer<'_> {
 fn write(out: &mut [u8], offset: usize, bytes: &[u8]) {
     for (to, byte) in out.iter_mut().skip(offset).zip(bytes) {
         *to = *byte;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crc::{CRC_32_ISO_HDLC, Crc};
+    use proptest::prelude::*;
+
+    #[test]
+    fn checksum_of_the_catalogue() {
+        assert_eq!(crc32(0, b"123456789"), 0xCBF4_3926);
+        assert_eq!(crc32(0, &[]), 0);
+    }
+
+    proptest! {
+        #[test]
+        fn checksums(bytes in prop::collection::vec(any::<u8>(), 0..70), at: prop::sample::Index) {
+            let (head, tail) = bytes.split_at(at.index(bytes.len() + 1));
+            let expected = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&bytes);
+            prop_assert_eq!(crc32(crc32(0, head), tail), expected);
+        }
     }
 }

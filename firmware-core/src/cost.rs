@@ -9,6 +9,7 @@
 use crate::SparseTerms;
 use crate::blob;
 use crate::dictionary::{Basis, Factor, Source};
+use crate::kernel::{Direct, Shape};
 use crate::model::{Space, State, Structure, Symmetry, Target};
 
 /// What one model takes.
@@ -66,7 +67,7 @@ impl Cost {
 /// }).unwrap();
 /// let terms: Vec<[u8; 2]> = (0..12).map(|function| [0, function]).collect();
 /// let terms = SparseTerms::new(structure.dictionary(), &terms).unwrap();
-/// assert_eq!(firmware_core::cost::instructions(&structure, Some(terms)), 875);
+/// assert_eq!(firmware_core::cost::instructions(&structure, Some(terms)), 922);
 /// ```
 pub fn instructions(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> u32 {
     let parts = parts(structure, terms);
@@ -84,17 +85,31 @@ pub struct Part {
     pub each: f32,
 }
 
-/// What a step does. Of a sparse model up to four outputs are summed while the terms are made, further
-/// ones two by two.
-pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part; 31] {
+/// What a step does. Of a sparse model up to four outputs are summed while the terms are made, further ones
+/// after them.
+pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part; 38] {
     let part = |name, count, each| Part { name, count, each };
-    let (dense, outputs) = (terms.is_none(), structure.outputs());
-    let observables = structure.dictionary().observables();
+    let mut direct = Direct::empty();
+    if terms.is_none() {
+        direct.fill(structure, structure.layout().end);
+    }
+    let known = Shape::of(structure, &direct);
+    let is_known = known.is_some();
+    let direct = Some(direct).filter(|direct| direct.is_some() && !is_known);
+    let [runs, tiles, folded] = direct.map_or([0; 3], |direct| direct.folds());
+    let is_direct = direct.is_some();
+    let planned = direct.is_some_and(|direct| direct.is_planned());
+    // A step that looks at every part of the model.
+    let at_length = !is_known && !is_direct;
+    let dense = at_length && terms.is_none();
+    let outputs = structure.outputs();
+    let all = structure.dictionary().observables();
+    let observables = if at_length { all } else { &[] };
     let scaled = observables.iter().filter(|o| dense || (o.centre, o.gain) != (0.0, 1.0)).count();
 
     // A sparse model has a factor per block, and no blocks for the kernel.
     let factors = structure.dictionary().blocks().flat_map(|(_, factors)| factors);
-    let factors = factors.filter(|_| !dense);
+    let factors = factors.filter(|_| terms.is_some());
     let beyond = |f: &&Factor| usize::from(f.order).saturating_sub(1);
     let of_basis = |basis| factors.clone().filter(move |f| f.basis == basis);
     let fourier = of_basis(Basis::Fourier).filter(|f| f.order > 1);
@@ -102,20 +117,25 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
     let fourier_harmonics = fourier.clone().map(|f| beyond(&f)).sum();
     let count = terms.map_or(0, |terms| terms.entries().len());
     let made = [1, 2, 3, 4].map(|n| if outputs.min(4) == n { count } else { 0 });
-    let later = if dense { 0 } else { outputs.saturating_sub(4) };
+    let later = if terms.is_none() { 0 } else { outputs.saturating_sub(4) };
 
     let blocks = structure.dictionary().blocks().filter(|_| dense);
     let blocks =
         blocks.map(|(_, own)| (own.len(), own.iter().map(|f| f.radix()).product::<usize>()));
     let block_count = blocks.clone().count();
 
+    let states = if is_known { &[] } else { structure.states() };
     let of =
-        |kind: &dyn Fn(&State<'_>) -> bool| structure.states().iter().filter(|s| kind(s)).count();
+        |kind: &dyn Fn(&State<'_>) -> bool| states.iter().filter(|s| !planned && kind(s)).count();
     let absolute = |s: &State<'_>| (s.space, s.target) == (Space::Circle, Target::Absolute);
-    let observed = |source: Source| observables.iter().any(|o| o.source == source);
+    let undelayed = if at_length && structure.delay_lines() == 0 { states.len() } else { 0 };
+    let planned_of =
+        |kind: &dyn Fn(&State<'_>) -> bool| states.iter().filter(|s| planned && kind(s)).count();
+    let observed = |source: Source| all.iter().any(|o| o.source == source);
     let heading =
         |i: u8| matches!(structure.symmetry(), Symmetry::Se2 { heading, .. } if heading == i);
-    let states = (0_u8..).zip(structure.states());
+    let se2 = matches!(structure.symmetry(), Symmetry::Se2 { .. });
+    let states = (0_u8..).zip(states).filter(|_| !planned);
     let turned = states.clone().filter(|(i, s)| {
         let needed = heading(*i) || observed(Source::Sin(*i)) || observed(Source::Cos(*i));
         (s.space, s.target) == (Space::Circle, Target::Increment) && needed
@@ -128,56 +148,63 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
     });
     let angles = angles.count();
     [
-        part("step", 1, 178.3),
-        part("step of a dense model", usize::from(dense), -103.3),
-        part("input", structure.inputs().len(), 11.4),
-        part("observable and its range", observables.len(), 13.7),
-        part("observable that is centred or scaled", scaled, 19.9),
-        part("source with a delay line", structure.delay_lines(), 6.7),
-        part("four numbers of the history moved on", structure.delayed() / 4, 12.9),
-        part("Fourier factor from order 2 on", fourier.count(), 14.5),
-        part("sine and cosine of a harmonic from the second on", fourier_harmonics, 17.9),
-        part("power from the second on", powers, 13.1),
-        part("term and its product with 1 output", made[0], 12.0),
-        part("term and its products with 2 outputs", made[1], 16.1),
-        part("term and its products with 3 outputs", made[2], 19.0),
-        part("term and its products with 4 outputs", made[3], 22.2),
-        part("more than 4 outputs", later.min(1), 39.1),
-        part("two further outputs", later / 2, 19.8),
-        part("term times two further outputs", later / 2 * count, 11.0),
-        part("last further output", later % 2, 14.5),
-        part("term times the last further output", later % 2 * count, 4.9),
+        part("step", usize::from(at_length), 248.6),
+        part("step of a dense model", usize::from(dense), -160.0),
+        part("step of the paper's drive", usize::from(known == Some(Shape::Drive)), 378.0),
+        part(
+            "step of the paper's drive by its pose",
+            usize::from(known == Some(Shape::Planar)),
+            167.0,
+        ),
+        part("step of a dense model without delays", usize::from(is_direct), 168.3),
+        part("observable of it", if is_direct { all.len() } else { 0 }, 6.7),
+        part("run of its axes", runs, 79.7),
+        part("tile", tiles, 1.7),
+        part("coefficient", folded, 1.1),
+        part("input", if is_known { 0 } else { structure.inputs().len() }, 13.8),
+        part("observable and its range", observables.len(), 14.2),
+        part("observable that is centred or scaled", scaled, 19.7),
+        part("source with a delay line", structure.delay_lines(), 6.2),
+        part("coordinate of a model without delays", undelayed, 3.4),
+        part("four numbers of the history moved on", structure.delayed() / 4, 12.7),
+        part("Fourier factor from order 2 on", fourier.count(), 9.8),
+        part("sine and cosine of a harmonic from the second on", fourier_harmonics, 20.6),
+        part("power from the second on", powers, 12.7),
+        part("term and its product with 1 output", made[0], 12.1),
+        part("term and its products with 2 outputs", made[1], 13.9),
+        part("term and its products with 3 outputs", made[2], 15.7),
+        part("term and its products with 4 outputs", made[3], 18.0),
+        part("further output", later, 17.3),
+        part("term times a further output", later * count, 5.1),
+        part("next value as planned", planned_of(&|s| s.space == Space::Line && !se2), 22.0),
+        part(
+            "next sine and cosine as planned",
+            planned_of(&|s| s.space == Space::Circle && !se2),
+            45.0,
+        ),
+        part("next pose as planned", usize::from(planned && se2), 97.0),
         part(
             "coordinate on R, next value",
             of(&|s| (s.space, s.target) == (Space::Line, Target::Absolute)),
-            43.3,
+            43.5,
         ),
         part(
             "coordinate on R, change",
             of(&|s| (s.space, s.target) == (Space::Line, Target::Increment)),
-            44.9,
+            45.4,
         ),
         part(
             "angle, change",
             of(&|s| (s.space, s.target) == (Space::Circle, Target::Increment)),
-            57.2,
+            61.1,
         ),
-        part("sine and cosine of an angle predicted by its change", turned, 53.2),
-        part("angle, next sine and cosine", of(&absolute), 92.8),
-        part("its limits or its observed change", angles, 155.6),
-        part(
-            "planar pose",
-            usize::from(matches!(structure.symmetry(), Symmetry::Se2 { .. })),
-            35.1,
-        ),
-        part("dense block", block_count, 341.7),
-        part("factor of a dense block", blocks.clone().map(|(factors, _)| factors).sum(), 74.3),
-        part("dense block and output", block_count * outputs, 23.3),
-        part(
-            "dense coefficient of the first 16 of a block",
-            blocks.clone().map(|(_, size)| size.min(16) * outputs).sum(),
-            14.2,
-        ),
-        part("dense coefficient", blocks.map(|(_, size)| size * outputs).sum(), 6.8),
+        part("sine and cosine of an angle predicted by its change", turned, 54.0),
+        part("angle, next sine and cosine", of(&absolute), 63.7),
+        part("its limits or its observed change", angles, 155.9),
+        part("planar pose", usize::from(se2 && !planned && !is_known), 37.0),
+        part("dense block", block_count, 214.7),
+        part("factor of a dense block", blocks.clone().map(|(factors, _)| factors).sum(), 234.0),
+        part("dense block and output", block_count * outputs, 82.2),
+        part("dense coefficient", blocks.map(|(_, size)| size * outputs).sum(), 5.3),
     ]
 }

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::capacity::{
     MAX_BASIS, MAX_BLOCK_FACTORS, MAX_BLOCKS, MAX_FACTORS, MAX_OBSERVABLES, MAX_ORDER, MAX_TERMS,
 };
+use crate::encoding::{ReadError, Reader};
 use crate::{Number, Scalar};
 
 /// What an observable reads. The number is the index of the state coordinate or input.
@@ -145,26 +146,89 @@ impl Dictionary {
         factors: Vec<Factor, MAX_FACTORS>,
         blocks: Vec<Block, MAX_BLOCKS>,
     ) -> Result<Self, DictionaryError> {
+        let mut dictionary = Self::unchecked(observables, factors, blocks);
+        dictionary.check::<DictionaryError>()?;
+        Ok(dictionary)
+    }
+
+    /// Parts of which nothing is known yet, to be [checked](Self::check).
+    pub(crate) fn unchecked(
+        observables: Vec<Observable, MAX_OBSERVABLES>,
+        factors: Vec<Factor, MAX_FACTORS>,
+        blocks: Vec<Block, MAX_BLOCKS>,
+    ) -> Self {
+        Self { observables, factors, blocks, dense_terms: 0 }
+    }
+
+    /// A dictionary of nothing, to be [read](Self::read) over.
+    pub(crate) const fn empty() -> Self {
+        Self { observables: Vec::new(), factors: Vec::new(), blocks: Vec::new(), dense_terms: 0 }
+    }
+
+    pub(crate) fn clear(&mut self) {
+        self.observables.clear();
+        self.factors.clear();
+        self.blocks.clear();
+        self.dense_terms = 0;
+    }
+
+    /// The parts of a dictionary as the metadata hold them, to be [checked](Self::check).
+    #[inline(never)]
+    pub(crate) fn read(&mut self, reader: &mut Reader<'_>) -> Result<(), ReadError> {
+        reader.list(&mut self.observables, |reader| {
+            let kind = reader.word()?;
+            if kind > 4 {
+                return Err(ReadError::Unsupported);
+            }
+            let (index, lag) = (reader.byte()?, reader.byte()?);
+            let source = match kind {
+                0 => Source::State(index),
+                1 => Source::Sin(index),
+                2 => Source::Cos(index),
+                3 => Source::Increment(index),
+                _ => Source::Input(index),
+            };
+            Ok(Observable { source, lag, centre: reader.number()?, gain: reader.number()? })
+        })?;
+        reader.list(&mut self.factors, |reader| {
+            let observable = reader.byte()?;
+            let basis = match reader.word()? {
+                0 => Basis::Hermite,
+                1 => Basis::Fourier,
+                _ => return Err(ReadError::Unsupported),
+            };
+            Ok(Factor { observable, basis, order: reader.byte()? })
+        })?;
+        reader.list(&mut self.blocks, |reader| {
+            Ok(Block { factors: reader.byte()?, max_degree: reader.byte()? })
+        })
+    }
+
+    /// Checks the parts. `E` is the error of whoever asks.
+    #[inline(never)]
+    pub(crate) fn check<E: From<DictionaryError>>(&mut self) -> Result<(), E> {
+        let Self { observables, factors, blocks, .. } = self;
         for (i, o) in observables.iter().enumerate() {
             let earlier = observables.iter().take(i);
             if earlier.into_iter().any(|e| (e.source, e.lag) == (o.source, o.lag)) {
-                return Err(DictionaryError::Duplicate { observable: i });
+                return Err(DictionaryError::Duplicate { observable: i }.into());
             }
         }
         let mut claimed = 0_usize;
         let mut dense_terms = 0_usize;
-        for block in &blocks {
+        for block in &*blocks {
             let count = usize::from(block.factors);
             if count > MAX_BLOCK_FACTORS {
                 return Err(DictionaryError::TooLarge {
                     field: "factors of a block",
                     capacity: MAX_BLOCK_FACTORS,
                     found: count,
-                });
+                }
+                .into());
             }
             let end = claimed.saturating_add(count);
             let Some(own) = factors.get(claimed..end) else {
-                return Err(DictionaryError::Factors { claimed: end, found: factors.len() });
+                return Err(DictionaryError::Factors { claimed: end, found: factors.len() }.into());
             };
             let mut size = 1_usize;
             for (i, factor) in own.iter().enumerate() {
@@ -174,10 +238,11 @@ impl Dictionary {
                         field: "order of a factor",
                         capacity: MAX_ORDER.into(),
                         found: factor.order.into(),
-                    });
+                    }
+                    .into());
                 }
                 let Some(o) = observables.get(usize::from(factor.observable)) else {
-                    return Err(bad);
+                    return Err(bad.into());
                 };
                 if factor.basis == Basis::Fourier {
                     let cosine = observables.get(usize::from(factor.observable).saturating_add(1));
@@ -186,11 +251,11 @@ impl Dictionary {
                         _ => false,
                     };
                     if !pair {
-                        return Err(bad);
+                        return Err(bad.into());
                     }
                 }
                 if own.iter().take(i).any(|e| overlap(*e, *factor)) {
-                    return Err(bad);
+                    return Err(bad.into());
                 }
                 size = size.saturating_mul(factor.radix());
             }
@@ -198,17 +263,17 @@ impl Dictionary {
             claimed = end;
         }
         if blocks.is_empty() || claimed != factors.len() {
-            return Err(DictionaryError::Factors { claimed, found: factors.len() });
+            return Err(DictionaryError::Factors { claimed, found: factors.len() }.into());
         }
         match u16::try_from(dense_terms) {
             Ok(n) if dense_terms <= MAX_TERMS => {
-                Ok(Self { observables, factors, blocks, dense_terms: n })
+                self.dense_terms = n;
+                Ok(())
             }
-            _ => Err(DictionaryError::TooLarge {
-                field: "terms",
-                capacity: MAX_TERMS,
-                found: dense_terms,
-            }),
+            _ => {
+                let (field, capacity, found) = ("terms", MAX_TERMS, dense_terms);
+                Err(DictionaryError::TooLarge { field, capacity, found }.into())
+            }
         }
     }
 

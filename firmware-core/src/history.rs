@@ -4,7 +4,7 @@
 use crate::Scalar;
 use crate::capacity::MAX_STATES;
 use crate::model::{Space, Structure, Symmetry, Target};
-use crate::registers::{GROUP, INPUTS, Kind, Layout, Registers};
+use crate::registers::{GROUP, Kind, Layout, Registers};
 
 /// One sample of the robot.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -26,15 +26,15 @@ impl<S: Scalar> Sample<S> {
 #[derive(Debug)]
 pub struct History<S> {
     registers: Registers<S>,
-    /// Which [`Layout`] the registers have, and what it keeps.
+    /// Which [`Layout`] the registers have, 0 as long as there is no sample, and what it keeps.
     layout: u32,
-    kept: (u8, u8),
+    kept: [(u8, u8); 2],
     filled: u8,
 }
 
 impl<S: Scalar> Default for History<S> {
     fn default() -> Self {
-        Self { registers: Registers::new(), layout: 0, kept: (0, 0), filled: 0 }
+        Self { registers: Registers::new(), layout: 0, kept: [(0, 0); 2], filled: 0 }
     }
 }
 
@@ -46,10 +46,11 @@ impl<S: Scalar> Clone for History<S> {
 
     fn clone_from(&mut self, other: &Self) {
         (self.layout, self.kept, self.filled) = (other.layout, other.kept, other.filled);
-        let (first, count) = other.kept;
-        let from = other.registers.slice(first, count.into());
-        for (to, x) in self.registers.slice_mut(first, count.into()).iter_mut().zip(from) {
-            *to = *x;
+        for (first, count) in other.kept {
+            let from = other.registers.slice(first, count.into());
+            for (to, x) in self.registers.slice_mut(first, count.into()).iter_mut().zip(from) {
+                *to = *x;
+            }
         }
     }
 }
@@ -58,10 +59,11 @@ impl<S: Scalar> Clone for History<S> {
 impl<S: Scalar> PartialEq for History<S> {
     fn eq(&self, other: &Self) -> bool {
         let kept = |history: &Self| (history.layout, history.kept, history.filled);
-        let ((first, count), (of_other, _)) = (self.kept, other.kept);
         kept(self) == kept(other)
-            && self.registers.slice(first, count.into())
-                == other.registers.slice(of_other, count.into())
+            && self.kept.iter().all(|(first, count)| {
+                let count = usize::from(*count);
+                self.registers.slice(*first, count) == other.registers.slice(*first, count)
+            })
     }
 }
 
@@ -82,9 +84,15 @@ impl<S: Scalar> History<S> {
         self.filled == 0
     }
 
-    /// Forgets all samples.
+    /// Forgets all samples, and which model they were of.
     pub fn clear(&mut self) {
-        self.filled = 0;
+        (self.layout, self.kept, self.filled) = (0, [(0, 0); 2], 0);
+    }
+
+    /// Whether there is a sample for a model of this layout.
+    #[inline]
+    pub(crate) fn is_of(&self, layout: &Layout) -> bool {
+        self.layout == layout.id
     }
 
     /// How many samples there are for a model of this layout.
@@ -116,7 +124,8 @@ impl<S: Scalar> History<S> {
             true => self.increment(structure, next),
             false => [S::ZERO; MAX_STATES],
         };
-        for (i, to) in self.registers.slice_mut(INPUTS, layout.inputs()).iter_mut().enumerate() {
+        let inputs = self.registers.slice_mut(layout.first_input, layout.inputs());
+        for (i, to) in inputs.iter_mut().enumerate() {
             *to = at(input, i as u8);
         }
         let mut staged = [[S::ZERO; GROUP]; MAX_STATES];
@@ -133,9 +142,12 @@ impl<S: Scalar> History<S> {
     /// Coordinate `i` of the present sample.
     #[inline]
     fn coordinate(&self, layout: &Layout, i: u8) -> S {
-        let present = self.registers.present(layout).get(usize::from(i));
-        let [x, _, sin, cos] = present.copied().unwrap_or_default();
-        if layout.kind(i).absolute_angle() { sin.atan2(cos) } else { x }
+        let place = layout.place(i);
+        if place.kind.absolute_angle() {
+            self.registers.get(place.sin).atan2(self.registers.get(place.cos))
+        } else {
+            self.registers.get(place.x)
+        }
     }
 
     /// The present coordinates in `out`, shape `[states]`: angles in \[−π, π\] where the model
@@ -156,9 +168,12 @@ impl<S: Scalar> History<S> {
         input: &'h [S],
     ) -> impl Iterator<Item = S> + 'h {
         let layout = structure.layout();
-        layout.observables.iter().map(move |register| match register.checked_sub(INPUTS) {
-            Some(index) if *register < layout.present => at(input, index),
-            _ => self.registers.get(*register),
+        let inputs = layout.inputs();
+        layout.observables.iter().map(move |register| {
+            match register.checked_sub(layout.first_input) {
+                Some(index) if usize::from(index) < inputs => at(input, index),
+                _ => self.registers.get(*register),
+            }
         })
     }
 
@@ -234,22 +249,21 @@ impl<S: Scalar> History<S> {
             *y = s * ahead + c * left;
         }
         let mut outputs = outputs.iter().copied();
-        let present = registers.present(layout);
-        for ((place, next), present) in layout.states.iter().zip(next).zip(present) {
+        for (place, next) in layout.states.iter().zip(next) {
             let z = outputs.next()?;
-            let ([from, ..], [to, change, sin, cos]) = (present, next);
+            let (from, [to, change, sin, cos]) = (registers.get(place.x), next);
             let x = match place.kind {
                 Kind::Line => {
-                    *change = z - *from;
+                    *change = z - from;
                     z
                 }
                 Kind::Increment => {
                     *change = z;
-                    z + *from
+                    z + from
                 }
                 Kind::Pose => {
                     *change = z;
-                    *to + *from
+                    *to + from
                 }
                 Kind::AngleIncrement | Kind::AngleIncrementTrigonometric => {
                     // Hundreds of turns within a step would only look fine once they are wrapped.
@@ -257,7 +271,7 @@ impl<S: Scalar> History<S> {
                         return None;
                     }
                     *change = z;
-                    let x = (z + *from).wrap();
+                    let x = (z + from).wrap();
                     if place.kind == Kind::AngleIncrementTrigonometric {
                         (*sin, *cos) = x.sin_cos_within();
                     }
@@ -269,9 +283,9 @@ impl<S: Scalar> History<S> {
                 }
                 Kind::Angle => {
                     [*sin, *cos] = on_circle([z, outputs.next()?])?;
-                    let [_, _, from_sin, from_cos] = present;
+                    let from = registers.get(place.sin).atan2(registers.get(place.cos));
                     let x = sin.atan2(*cos);
-                    *change = (x - from_sin.atan2(*from_cos)).wrap();
+                    *change = (x - from).wrap();
                     x
                 }
             };
@@ -309,8 +323,8 @@ impl<S: Scalar> History<S> {
             *d = if circle == Some(Space::Circle) { change.wrap() } else { change };
         }
         if let Symmetry::Se2 { x, y, heading } = structure.symmetry() {
-            let present = self.registers.present(layout).get(usize::from(heading));
-            let [_, _, s, c] = present.copied().unwrap_or_default();
+            let place = layout.place(heading);
+            let (s, c) = (self.registers.get(place.sin), self.registers.get(place.cos));
             let (dx, dy) = (at(&increment, x), at(&increment, y));
             if let Some(ahead) = increment.get_mut(usize::from(x)) {
                 *ahead = c * dx + s * dy;
@@ -323,20 +337,13 @@ impl<S: Scalar> History<S> {
     }
 }
 
-/// How far from the circle (sin, cos) may be, as a factor, and how far an angle may turn within a
-/// step \[rad\], before a prediction counts as diverged.
-const LONG: f32 = 1e3;
+/// How far an angle may turn within a step \[rad\] before a prediction counts as diverged.
+pub(crate) const LONG: f32 = 1e3;
 
 /// Sine and cosine, back on the circle; `None` if they have lost their direction.
-#[inline(never)]
-fn on_circle<S: Scalar>([s, c]: [S; 2]) -> Option<[S; 2]> {
-    let square = s * s + c * c;
-    // Far from the circle the direction means nothing; also catches NaN.
-    if !(square > S::from_f32(1.0 / (LONG * LONG)) && square < S::from_f32(LONG * LONG)) {
-        return None;
-    }
-    let shrink = square.reciprocal_root();
-    Some([s * shrink, c * shrink])
+#[inline]
+fn on_circle<S: Scalar>(mut pair: [S; 2]) -> Option<[S; 2]> {
+    S::on_circle(&mut pair).then_some(pair)
 }
 
 impl Structure<'_> {

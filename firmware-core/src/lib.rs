@@ -33,8 +33,11 @@
 //! | [`model`] | `ModelRepr` (what the bytes say), `Structure` and `Model` (checked once) |
 //! | [`history`] | samples: from coordinates to observables, from outputs back to coordinates |
 //! | [`blob`] | the bytes of a model: layout, parse, emit |
+//! | `encoding` (private) | what postcard has written, read in place |
 //! | [`predictor`] | `Predictor` (immutable) and `PredictorState`: step, rollout, held inputs |
-//! | `registers`, `kernel` (private) | where the numbers of a step lie, and how it computes them |
+//! | [`kernel`] | how a step evaluates the operator: portable, and on a Cortex-M4F |
+//! | [`q31`] | models in fixed point, for controllers without a floating-point unit |
+//! | `registers` (private) | where the numbers of a step lie |
 //! | [`control_loop`] | sense, predict, act: the soft leg and the ROSbot |
 //! | [`slots`] | two flash slots for models: write, trial, confirm, revert |
 //! | [`link`] | messages between host and controller over a serial line |
@@ -53,6 +56,8 @@
         clippy::unreachable
     )
 )]
+// Only assembly needs it, which no other machine has.
+#![cfg_attr(not(any(cortex_m4f, q31_kernel)), forbid(unsafe_code))]
 
 #[cfg(target_endian = "big")]
 compile_error!("blobs are little-endian and are read in place");
@@ -63,12 +68,14 @@ pub mod control_loop;
 pub mod cost;
 pub mod device;
 pub mod dictionary;
+mod encoding;
 pub mod error_bounds;
 pub mod history;
-mod kernel;
+pub mod kernel;
 pub mod link;
 pub mod model;
 pub mod predictor;
+pub mod q31;
 mod registers;
 mod scalar;
 pub mod slots;

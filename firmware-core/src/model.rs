@@ -9,8 +9,9 @@ use serde::{Deserialize, Serialize};
 use crate::Scalar;
 use crate::capacity::{MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_STATES};
 use crate::dictionary::{Block, Dictionary, DictionaryError, Factor, Observable, Source};
+use crate::encoding::{ReadError, Reader};
 use crate::error_bounds::ErrorBounds;
-use crate::kernel::Program;
+use crate::kernel::{Known, Program};
 use crate::registers::{GROUP, Layout};
 use crate::sparse::{SparseError, SparseTerms};
 
@@ -195,6 +196,18 @@ pub enum ModelError {
     },
 }
 
+impl From<DictionaryError> for ModelError {
+    fn from(error: DictionaryError) -> Self {
+        Self::Dictionary(error)
+    }
+}
+
+impl From<SparseError> for ModelError {
+    fn from(error: SparseError) -> Self {
+        Self::Sparse(error)
+    }
+}
+
 /// A checked model without its coefficients: spaces, symmetry, targets, dictionary.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Structure<'a> {
@@ -216,14 +229,6 @@ impl<'a> TryFrom<ModelRepr<'a>> for Structure<'a> {
     type Error = ModelError;
 
     fn try_from(repr: ModelRepr<'a>) -> Result<Self, ModelError> {
-        Self::check(repr)
-    }
-}
-
-impl<'a> Structure<'a> {
-    /// [`try_from`](Self::try_from) with the caller's error, so that no result has to be moved.
-    #[inline(never)]
-    pub(crate) fn check<E: From<ModelError>>(repr: ModelRepr<'a>) -> Result<Self, E> {
         let ModelRepr {
             robot,
             sample_time_s,
@@ -235,77 +240,173 @@ impl<'a> Structure<'a> {
             blocks,
             provenance,
         } = repr;
-        if states.is_empty() {
+        let mut structure =
+            Self { robot, sample_time_s, states, inputs, symmetry, provenance, ..Self::empty() };
+        // What is wrong with the dictionary is looked at when its turn comes.
+        structure.dictionary = Dictionary::unchecked(observables, factors, blocks);
+        structure.check::<ModelError>()?;
+        structure.lay_out();
+        Ok(structure)
+    }
+}
+
+impl<'a> Structure<'a> {
+    /// Of nothing, to be [read](Self::read) over.
+    pub(crate) const fn empty() -> Self {
+        Self {
+            robot: "",
+            sample_time_s: 0.0,
+            states: Vec::new(),
+            inputs: Vec::new(),
+            symmetry: Symmetry::None,
+            dictionary: Dictionary::empty(),
+            provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+            outputs: 0,
+            lag: 0,
+            trigonometric: 0,
+            layout: Layout::empty(),
+        }
+    }
+
+    fn clear(&mut self) {
+        let Self { robot, sample_time_s, states, inputs, symmetry, dictionary, provenance, .. } =
+            self;
+        (*robot, *sample_time_s, *symmetry) = ("", 0.0, Symmetry::None);
+        states.clear();
+        inputs.clear();
+        dictionary.clear();
+        provenance.logs.fill(0);
+        provenance.robot.fill(0);
+        (self.outputs, self.lag, self.trigonometric) = (0, 0, 0);
+        self.layout.clear();
+    }
+
+    /// The metadata of a blob as they are, a [`ModelRepr`], to be [checked](Self::check).
+    #[inline(always)]
+    pub(crate) fn read(&mut self, bytes: &'a [u8]) -> Result<(), ReadError> {
+        let mut reader = Reader::new(bytes);
+        self.read_spaces(&mut reader)?;
+        self.dictionary.read(&mut reader)?;
+        self.provenance = Provenance { logs: reader.array()?, robot: reader.array()? };
+        reader.end()
+    }
+
+    /// What is in front of the dictionary.
+    #[inline(never)]
+    fn read_spaces(&mut self, reader: &mut Reader<'a>) -> Result<(), ReadError> {
+        self.robot = reader.text()?;
+        self.sample_time_s = reader.number()?;
+        reader.list(&mut self.states, |reader| {
+            let (name, unit) = (reader.text()?, reader.text()?);
+            let space = match reader.word()? {
+                0 => Space::Line,
+                1 => Space::Circle,
+                _ => return Err(ReadError::Unsupported),
+            };
+            let target = match reader.word()? {
+                0 => Target::Absolute,
+                1 => Target::Increment,
+                _ => return Err(ReadError::Unsupported),
+            };
+            Ok(State { name, unit, space, target, limit: reader.numbers()? })
+        })?;
+        reader.list(&mut self.inputs, |reader| {
+            Ok(Input { name: reader.text()?, unit: reader.text()?, range: reader.numbers()? })
+        })?;
+        self.symmetry = match reader.word()? {
+            0 => Symmetry::None,
+            1 => Symmetry::Translation { coordinates: reader.byte()? },
+            2 => Symmetry::Se2 { x: reader.byte()?, y: reader.byte()?, heading: reader.byte()? },
+            _ => return Err(ReadError::Unsupported),
+        };
+        Ok(())
+    }
+
+    /// Checks what was read; it is to be [laid out](Self::lay_out) then.
+    ///
+    /// Like what it consists of, and what follows when a blob is loaded, it has the error of whoever asks:
+    /// every other one would have a place on the stack of its own.
+    #[inline(always)]
+    pub(crate) fn check<E>(&mut self) -> Result<(), E>
+    where
+        E: From<ModelError> + From<DictionaryError>,
+    {
+        let mut checked = self.check_spaces();
+        if checked.is_ok() {
+            checked = self.dictionary.check();
+        }
+        if checked.is_ok() {
+            checked = self.check_observables();
+        }
+        checked
+    }
+
+    /// Where a history keeps what was checked.
+    #[inline(always)]
+    pub(crate) fn lay_out(&mut self) {
+        let observables = self.dictionary.observables();
+        let (inputs, symmetry) = (self.inputs.len(), self.symmetry);
+        self.layout.fill(&self.states, inputs, symmetry, observables, self.trigonometric);
+    }
+
+    #[inline(never)]
+    fn check_spaces<E: From<ModelError>>(&mut self) -> Result<(), E> {
+        if self.states.is_empty() {
             return Err(ModelError::NoState.into());
         }
-        if !(sample_time_s.is_finite() && sample_time_s > 0.0) {
+        if !(self.sample_time_s.is_finite() && self.sample_time_s > 0.0) {
             return Err(ModelError::SampleTime.into());
         }
-        let (mut outputs, mut trigonometric) = (0_u8, 0_u8);
-        for (index, state) in states.iter().enumerate() {
+        (self.outputs, self.trigonometric) = (0, 0);
+        for (index, state) in self.states.iter().enumerate() {
             let [low, high] = state.limit;
             if low.partial_cmp(&high) != Some(Ordering::Less) {
                 return Err(ModelError::Number { field: "limit of a state", index }.into());
             }
             let absolute_angle = (state.space, state.target) == (Space::Circle, Target::Absolute);
-            outputs = outputs.saturating_add(if absolute_angle { 2 } else { 1 });
+            self.outputs = self.outputs.saturating_add(if absolute_angle { 2 } else { 1 });
             if absolute_angle {
-                trigonometric |= bit(index);
+                self.trigonometric |= bit(index);
             }
         }
-        for (index, input) in inputs.iter().enumerate() {
+        for (index, input) in self.inputs.iter().enumerate() {
             let [low, high] = input.range;
             if !(low < high && low.is_finite() && high.is_finite()) {
                 return Err(ModelError::Number { field: "range of an input", index }.into());
             }
         }
-        check_symmetry(symmetry, &states)?;
-        if let Symmetry::Se2 { heading, .. } = symmetry {
-            trigonometric |= bit(heading.into());
+        check_symmetry(self.symmetry, &self.states)?;
+        if let Symmetry::Se2 { heading, .. } = self.symmetry {
+            self.trigonometric |= bit(heading.into());
         }
+        Ok(())
+    }
 
-        let dictionary =
-            Dictionary::new(observables, factors, blocks).map_err(ModelError::Dictionary)?;
-        let mut lag = 0_u8;
-        for (index, o) in dictionary.observables().iter().enumerate() {
-            let space = |i: u8| states.get(usize::from(i)).map(|s| s.space);
-            let free = |i: u8| !symmetry.excludes(i);
+    #[inline(never)]
+    fn check_observables<E: From<ModelError>>(&mut self) -> Result<(), E> {
+        self.lag = 0;
+        for (index, o) in self.dictionary.observables().iter().enumerate() {
+            let space = |i: u8| self.states.get(usize::from(i)).map(|s| s.space);
+            let free = |i: u8| !self.symmetry.excludes(i);
             let fits = match o.source {
                 Source::State(i) => space(i) == Some(Space::Line) && free(i),
                 Source::Sin(i) | Source::Cos(i) => {
-                    trigonometric |= bit(i.into());
+                    self.trigonometric |= bit(i.into());
                     space(i) == Some(Space::Circle) && free(i) && (o.centre, o.gain) == (0.0, 1.0)
                 }
                 Source::Increment(i) => space(i).is_some() && o.lag > 0,
-                Source::Input(i) => usize::from(i) < inputs.len(),
+                Source::Input(i) => usize::from(i) < self.inputs.len(),
             };
             if !fits || usize::from(o.lag) > MAX_LAG {
                 return Err(ModelError::Observable { observable: index }.into());
             }
             if !(o.centre.is_finite() && o.gain.is_finite() && o.gain != 0.0) {
-                return Err(
-                    ModelError::Number { field: "centre or gain of an observable", index }.into()
-                );
+                let field = "centre or gain of an observable";
+                return Err(ModelError::Number { field, index }.into());
             }
-            lag = lag.max(o.lag);
+            self.lag = self.lag.max(o.lag);
         }
-        let layout =
-            Layout::new(&states, inputs.len(), symmetry, dictionary.observables(), |coordinate| {
-                trigonometric & bit(coordinate) != 0
-            });
-        Ok(Self {
-            robot,
-            sample_time_s,
-            states,
-            inputs,
-            symmetry,
-            dictionary,
-            provenance,
-            outputs,
-            lag,
-            trigonometric,
-            layout,
-        })
+        Ok(())
     }
 }
 
@@ -419,7 +520,8 @@ impl<'a> Structure<'a> {
     /// # Errors
     /// [`ModelError`] with what it would take.
     pub fn fits(&self, terms: Option<SparseTerms<'_>>) -> Result<(), ModelError> {
-        Program::new(self, terms).map(|_| ())
+        let mut program = Program::empty();
+        program.fill(self, terms)
     }
 
     /// The metadata again, as a blob holds it.
@@ -452,6 +554,8 @@ pub struct Model<'a, S = f32> {
     terms: Option<SparseTerms<'a>>,
     /// How the registers are computed.
     program: Program,
+    /// Set if a controller may have a kernel for the whole model.
+    known: Option<Known<'a, S>>,
     coefficients: &'a [S],
     ranges: Option<&'a [[S; 2]]>,
     error_bounds: Option<ErrorBounds<'a>>,
@@ -473,7 +577,9 @@ impl<'a, S: Scalar> Model<'a, S> {
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
     ) -> Result<Self, ModelError> {
-        Self::join(structure, None, coefficients, ranges, |_| Ok(()))
+        let mut model = Self { structure, ..Self::empty() };
+        model.join(None, coefficients, ranges)?;
+        Ok(model)
     }
 
     /// Joins a structure whose blocks are single factors, a chain of products of their functions and
@@ -526,35 +632,94 @@ impl<'a, S: Scalar> Model<'a, S> {
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
     ) -> Result<Self, ModelError> {
-        Self::join(structure, Some(terms), coefficients, ranges, |_| Ok(()))
+        let mut model = Self { structure, ..Self::empty() };
+        model.join(Some(terms), coefficients, ranges)?;
+        Ok(model)
     }
 
-    /// A dense model, or a sparse one with these terms, to be completed by the caller where it lies;
-    /// with the caller's error, so that no result has to be moved.
+    /// A model of nothing, which predicts nothing: where
+    /// [`parse_into`](crate::blob::parse_into) puts one.
+    pub const fn empty() -> Self {
+        Self {
+            structure: Structure::empty(),
+            terms: None,
+            program: Program::empty(),
+            known: None,
+            coefficients: &[],
+            ranges: None,
+            error_bounds: None,
+        }
+    }
+
+    /// Becomes [empty](Self::empty) in place.
     #[inline(never)]
-    pub(crate) fn join<E: From<ModelError>>(
-        structure: Structure<'a>,
+    pub(crate) fn clear(&mut self) {
+        let Self { structure, terms, program, known, coefficients, ranges, error_bounds } = self;
+        structure.clear();
+        program.clear();
+        (*terms, *known, *ranges, *error_bounds) = (None, None, None, None);
+        *coefficients = &[];
+    }
+
+    /// The structure, to be read and checked before anything else is taken.
+    pub(crate) fn structure_mut(&mut self) -> &mut Structure<'a> {
+        &mut self.structure
+    }
+
+    /// Joins the structure, which has been checked, with its coefficients: a dense model, or a sparse
+    /// one with these terms.
+    pub(crate) fn join(
+        &mut self,
         terms: Option<&'a [[u8; 2]]>,
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
-        complete: impl FnOnce(&mut Self) -> Result<(), E>,
-    ) -> Result<Self, E> {
-        let terms = terms.map(|terms| SparseTerms::new(structure.dictionary(), terms));
-        let terms = terms.transpose().map_err(ModelError::Sparse)?;
-        let program = Program::new(&structure, terms)?;
-        let pairs = ranges.map(|ranges| ranges.as_chunks().0);
-        let mut model =
-            Self { structure, terms, program, coefficients, ranges: pairs, error_bounds: None };
-        let structure = &model.structure;
-        let expected = structure.outputs().saturating_mul(model.coefficients_per_output());
-        let mismatch = |field, expected, found| {
-            Err(ModelError::DimensionMismatch { field, expected, found }.into())
-        };
+    ) -> Result<(), ModelError> {
+        self.take_terms(terms)?;
+        self.lay_out::<ModelError>()?;
+        self.shorten();
+        self.take_numbers(coefficients, ranges)
+    }
+
+    /// The terms of a sparse model, or that there are none.
+    #[inline]
+    pub(crate) fn take_terms(&mut self, terms: Option<&'a [[u8; 2]]>) -> Result<(), SparseError> {
+        let dictionary = self.structure.dictionary();
+        self.terms = terms.map(|terms| SparseTerms::new(dictionary, terms)).transpose()?;
+        Ok(())
+    }
+
+    /// What the registers are, once structure and terms are there.
+    pub(crate) fn lay_out<E: From<ModelError>>(&mut self) -> Result<(), E> {
+        self.program.fill(&self.structure, self.terms)
+    }
+
+    /// What makes the step of some dense models short, once the registers are known.
+    #[inline]
+    pub(crate) fn shorten(&mut self) {
+        if self.terms.is_none() {
+            self.program.shorten(&self.structure);
+        }
+    }
+
+    /// Coefficients and trained ranges of a model with its terms. Error bounds come later.
+    #[inline]
+    pub(crate) fn take_numbers(
+        &mut self,
+        coefficients: &'a [S],
+        ranges: Option<&'a [S]>,
+    ) -> Result<(), ModelError> {
+        self.error_bounds = None;
+        self.coefficients = coefficients;
+        self.ranges = ranges.map(|ranges| ranges.as_chunks().0);
+        let structure = &self.structure;
+        let expected = structure.outputs().saturating_mul(self.coefficients_per_output());
+        let mismatch =
+            |field, expected, found| Err(ModelError::DimensionMismatch { field, expected, found });
         if coefficients.len() != expected {
             return mismatch("coefficients", expected, coefficients.len());
         }
         if let Some(coefficient) = coefficients.iter().position(|c| !c.is_finite()) {
-            return Err(ModelError::NotFinite { coefficient }.into());
+            return Err(ModelError::NotFinite { coefficient });
         }
         if let Some(ranges) = ranges {
             let expected = structure.dictionary().observables().len().saturating_mul(2);
@@ -566,13 +731,16 @@ impl<'a, S: Scalar> Model<'a, S> {
                 .iter()
                 .position(|[low, high]| low.partial_cmp(high).is_none_or(Ordering::is_gt))
             {
-                return Err(
-                    ModelError::Number { field: "trained range of an observable", index }.into()
-                );
+                return Err(ModelError::Number { field: "trained range of an observable", index });
             }
         }
-        complete(&mut model)?;
-        Ok(model)
+        self.known = match (self.program.direct(), self.ranges) {
+            (Some(direct), Some(ranges)) => {
+                Known::new(&self.structure, direct, ranges, coefficients)
+            }
+            _ => None,
+        };
+        Ok(())
     }
 
     /// The same model with these error bounds instead of any it has.
@@ -614,6 +782,12 @@ impl<'a, S: Scalar> Model<'a, S> {
     #[inline]
     pub(crate) fn program(&self) -> &Program {
         &self.program
+    }
+
+    /// The model as a controller may have a kernel for it.
+    #[inline]
+    pub(crate) fn known(&self) -> Option<&Known<'a, S>> {
+        self.known.as_ref()
     }
 
     /// Coefficients per output: dense terms of the dictionary, or sparse terms with the constant.

@@ -2,11 +2,10 @@
 
 use crate::Scalar;
 use crate::capacity::{MAX_OUTPUTS, MAX_STATES};
-use crate::dictionary::Dictionary;
 use crate::history::History;
-use crate::kernel::{Scratch, contract};
+use crate::kernel::{self, Constants, Direct, Known};
 use crate::model::Model;
-use crate::registers::{GROUP, INPUTS, Layout, Registers};
+use crate::registers::{FIRST, GROUP, Layout, Registers};
 
 /// The first time a rollout left the range that the model was trained in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -103,6 +102,12 @@ impl<S: Scalar> PredictorState<S> {
     /// Nothing observed yet.
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// Forgets everything, as if new.
+    pub fn clear(&mut self) {
+        self.history.clear();
+        (self.step, self.out_of_range) = (0, None);
     }
 
     /// Steps predicted since the last measurement.
@@ -207,48 +212,137 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     /// # Errors
     /// [`PredictError::NotReady`] until the history is full, [`PredictError::DimensionMismatch`],
     /// [`PredictError::InputNotFinite`], [`PredictError::Diverged`]; the state is unchanged.
-    #[inline]
+    #[inline(always)]
     pub fn step(&self, state: &mut PredictorState<S>, input: &[S]) -> Result<(), PredictError> {
+        match self.model.known() {
+            Some(known) if self.step_known(known, state, input) => Ok(()),
+            _ if self.step_otherwise(state, input) => Ok(()),
+            _ => Err(self.why_not(state, input)),
+        }
+    }
+
+    /// Why a step from an unchanged state was not made.
+    #[cold]
+    #[inline(never)]
+    fn why_not(&self, state: &PredictorState<S>, input: &[S]) -> PredictError {
+        let structure = self.model.structure();
+        if let Err(error) = expect_inputs(structure.inputs().len(), input) {
+            return error;
+        }
+        let have = state.history.ready(structure.layout());
+        let need = structure.lag().saturating_add(1);
+        if have < need {
+            return PredictError::NotReady { have, need };
+        }
+        PredictError::Diverged { step: state.step.saturating_add(1) }
+    }
+
+    /// [`step`](Self::step) of a model that the controller has a kernel for; `false`, and nothing that is kept
+    /// has changed, if there is none, or anything is unusual.
+    #[inline(always)]
+    fn step_known(self, known: &Known<'_, S>, state: &mut PredictorState<S>, input: &[S]) -> bool {
+        let [first, second] = input else { return false };
+        if !state.history.is_of(self.model.structure().layout()) {
+            return false;
+        }
+        let constants = self.model.program().constants();
+        let registers = state.history.registers_mut().all_mut();
+        let made = match known {
+            Known::Drive(ranges, coefficients) => {
+                let [_, _, _, _, to_first, to_second, ..] = registers;
+                (*to_first, *to_second) = (*first, *second);
+                S::drive(constants, ranges, coefficients, registers)
+            }
+            Known::Planar(ranges, coefficients) => {
+                let [to_first, to_second, ..] = registers;
+                (*to_first, *to_second) = (*first, *second);
+                S::planar(constants, ranges, coefficients, registers)
+            }
+        };
+        if made {
+            state.step = state.step.saturating_add(1);
+        }
+        made
+    }
+
+    /// [`step`](Self::step) of a model that the controller has no kernel for; `false`, and nothing that is kept
+    /// has changed, if there is no prediction.
+    #[inline(never)]
+    fn step_otherwise(self, state: &mut PredictorState<S>, input: &[S]) -> bool {
+        match self.model.program().direct() {
+            Some(direct) if self.step_directly(direct, state, input).is_some() => true,
+            _ => self.step_at_length(state, input).is_some(),
+        }
+    }
+
+    /// [`step`](Self::step) of a model whose registers are as its kernel takes them. `None`, and nothing that
+    /// is kept has changed, if anything is unusual: the other one says what.
+    #[inline(never)]
+    fn step_directly(
+        self,
+        direct: &Direct,
+        state: &mut PredictorState<S>,
+        input: &[S],
+    ) -> Option<()> {
+        let layout = self.model.structure().layout();
+        take_input(layout, state, input)?;
+        let registers = state.history.registers_mut();
+        let (ranges, coefficients) = (self.model.range_pairs(), self.model.coefficients());
+        let first = self.model.program().first();
+        let outputs = state.outputs.get_mut(..direct.count())?;
+        direct.outputs(registers, first, ranges, coefficients, outputs)?;
+        self.advance(direct, state)?;
+        state.step = state.step.saturating_add(1);
+        Some(())
+    }
+
+    /// Moves a state on to the outputs in it.
+    #[inline(always)]
+    fn advance(self, direct: &Direct, state: &mut PredictorState<S>) -> Option<()> {
+        let layout = self.model.structure().layout();
+        let outputs = state.outputs.get_mut(..direct.count())?;
+        if direct.advance(layout, state.history.registers_mut(), outputs).is_none() {
+            stage(state, layout, direct.count())?;
+            state.history.advance(layout, &state.next);
+        }
+        Some(())
+    }
+
+    /// [`step`](Self::step) of any model, sparse or dense. `None`, and nothing that is kept has changed, if there
+    /// is no prediction.
+    #[inline(never)]
+    fn step_at_length(self, state: &mut PredictorState<S>, input: &[S]) -> Option<()> {
         let (structure, program) = (self.model.structure(), self.model.program());
         let layout = structure.layout();
-        let (have, need) = (state.history.ready(layout), structure.lag().saturating_add(1));
-        if have < need {
-            expect_inputs(layout.inputs(), input)?;
-            return Err(PredictError::NotReady { have, need });
+        if state.history.ready(layout) <= structure.lag() {
+            return None;
         }
-        expect("inputs", layout.inputs(), input.len())?;
+        take_input(layout, state, input)?;
         let registers = state.history.registers_mut();
-        for (register, u) in registers.slice_mut(INPUTS, input.len()).iter_mut().zip(input) {
-            if !u.is_finite() {
-                return expect_inputs(input.len(), input);
-            }
-            *register = *u;
-        }
-        let step = state.step.saturating_add(1);
-
+        let (dictionary, coefficients) = (structure.dictionary(), self.model.coefficients());
         let ranges = self.model.range_pairs();
         let mut outside = 0;
         for (register, [low, high]) in layout.observables.iter().zip(ranges) {
             outside |= registers.get(*register).outside(*low, *high);
         }
         let outputs = state.outputs.get_mut(..structure.outputs()).unwrap_or_default();
-        let (dictionary, coefficients) = (structure.dictionary(), self.model.coefficients());
         let next = program.scale(dictionary.observables(), registers);
         if self.model.terms().is_some() {
             program.outputs(next, registers, coefficients, outputs);
         } else {
-            dense(dictionary, program.values(registers), coefficients, outputs);
+            let blocks = dictionary.blocks().map(|(_, factors)| factors);
+            let values = program.values(registers);
+            kernel::outputs(blocks, dictionary.dense_terms(), values, coefficients, outputs);
         }
-        let staged = state.history.stage(layout, outputs, &mut state.next);
-        staged.ok_or(PredictError::Diverged { step })?;
-
+        stage(state, layout, structure.outputs())?;
+        let step = state.step.saturating_add(1);
         if outside >> 31 != 0 && state.out_of_range.is_none() {
             let observable = first_outside(layout, state.history.registers(), ranges);
             state.out_of_range = observable.map(|observable| OutOfRange { step, observable });
         }
         state.history.advance(layout, &state.next);
         state.step = step;
-        Ok(())
+        Some(())
     }
 
     /// The present coordinates in `out`, shape `[states]`: measured or predicted, whichever came
@@ -305,11 +399,68 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         let (n, _) = self.dimensions();
         let horizon = predicted.len().checked_div(n).unwrap_or(0);
         expect("predicted", horizon.saturating_mul(n), predicted.len())?;
-        for out in predicted.chunks_exact_mut(n) {
+        let done = self.hold_directly(state, input, horizon, predicted).unwrap_or(0);
+        for out in predicted.chunks_exact_mut(n).skip(done) {
             self.step(state, input)?;
             state.history.coordinates(self.model.structure(), out);
         }
         Ok(())
+    }
+
+    /// Moves the state `steps` sample times on with one input, shape `[inputs]`, held: what as many
+    /// [steps](Self::step) do, to the bit. Where only the end counts this takes less than
+    /// [`rollout_held`](Self::rollout_held), which takes an arc tangent for every angle that it says.
+    ///
+    /// # Errors
+    /// As [`step`](Self::step); the state is as it was after the last step that succeeded.
+    pub fn hold(
+        &self,
+        state: &mut PredictorState<S>,
+        input: &[S],
+        steps: usize,
+    ) -> Result<(), PredictError> {
+        let done = self.hold_directly(state, input, steps, &mut []).unwrap_or(0);
+        for _ in done..steps {
+            self.step(state, input)?;
+        }
+        Ok(())
+    }
+
+    /// As many steps with the input held as there is nothing unusual about, their coordinates in the rows of
+    /// `path`, as far as it goes.
+    #[inline(never)]
+    fn hold_directly(
+        self,
+        state: &mut PredictorState<S>,
+        input: &[S],
+        steps: usize,
+        path: &mut [S],
+    ) -> Option<usize> {
+        let (n, _) = self.dimensions();
+        let direct = self.model.program().direct()?;
+        let (structure, first) = (self.model.structure(), self.model.program().first());
+        take_input(structure.layout(), state, input)?;
+        let (ranges, coefficients) = (self.model.range_pairs(), self.model.coefficients());
+        direct.hold(state.history.registers_mut(), first, ranges, coefficients)?;
+        let held = first.saturating_add(direct.observables() as u8);
+        let done = self.model.known().map_or(0, |known| {
+            hold_known(known, self.model.program().constants(), state, held, steps, path)
+        });
+        for row in done..steps {
+            let outputs = state.outputs.get_mut(..direct.count())?;
+            let registers = state.history.registers_mut();
+            let count = coefficients.len();
+            let made = direct.outputs_held(registers, first, ranges, count, outputs);
+            if made.and_then(|()| self.advance(direct, state)).is_none() {
+                return Some(row);
+            }
+            state.step = state.step.saturating_add(1);
+            let start = row.saturating_mul(n);
+            if let Some(row) = path.get_mut(start..start.saturating_add(n)) {
+                state.history.coordinates(structure, row);
+            }
+        }
+        Some(steps)
     }
 
     /// States (at least 1) and inputs.
@@ -317,6 +468,94 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         let structure = self.model.structure();
         (structure.states().len().clamp(1, MAX_STATES), structure.inputs().len())
     }
+}
+
+/// As many steps as there is nothing unusual about, with the inputs held, of a model that the controller has a
+/// kernel for; what the inputs have left of the coefficients begins with register `held`.
+#[inline(never)]
+fn hold_known<S: Scalar>(
+    known: &Known<'_, S>,
+    constants: &Constants,
+    state: &mut PredictorState<S>,
+    held: u8,
+    steps: usize,
+    path: &mut [S],
+) -> usize {
+    let is_empty = path.is_empty();
+    let rows = path.as_chunks_mut::<3>().0.iter_mut();
+    let mut done = 0_usize;
+    let (registers, held) = state.history.registers_mut().split_at_mut(held);
+    let registers = registers.get_mut(FIRST.into()..).unwrap_or_default();
+    match known {
+        Known::Drive(ranges, _) => {
+            let (Some(held), Some(present)) = (held.first_chunk(), registers.first_chunk_mut())
+            else {
+                return 0;
+            };
+            for row in rows.take(steps) {
+                if !S::drive_held(constants, ranges, present, held) {
+                    break;
+                }
+                let [x, y, s, c] = *present;
+                *row = [x, y, s.atan2(c)];
+                done = done.wrapping_add(1);
+            }
+            // Shortest where only the end counts.
+            if is_empty {
+                while done < steps && S::drive_held(constants, ranges, present, held) {
+                    done = done.wrapping_add(1);
+                }
+            }
+        }
+        Known::Planar(..) => {
+            let pose = registers.get_mut(2..).and_then(|pose| pose.first_chunk_mut());
+            let (Some(held), Some(pose)) = (held.first_chunk(), pose) else { return 0 };
+            for row in rows.take(steps) {
+                if !S::planar_held(constants, pose, held) {
+                    break;
+                }
+                let [x, y, heading, _, _] = *pose;
+                *row = [x, y, heading];
+                done = done.wrapping_add(1);
+            }
+            if is_empty {
+                while done < steps && S::planar_held(constants, pose, held) {
+                    done = done.wrapping_add(1);
+                }
+            }
+        }
+    }
+    state.step = state.step.saturating_add(u32::try_from(done).unwrap_or(u32::MAX));
+    done
+}
+
+/// Puts the input of a step where it belongs, if it is as it should be and the model looks at the present sample
+/// alone, which is there.
+#[inline(always)]
+fn take_input<S: Scalar>(
+    layout: &Layout,
+    state: &mut PredictorState<S>,
+    input: &[S],
+) -> Option<()> {
+    if !state.history.is_of(layout) || input.len() != layout.inputs() {
+        return None;
+    }
+    let registers = state.history.registers_mut();
+    let inputs = registers.slice_mut(layout.first_input, input.len());
+    for (register, u) in inputs.iter_mut().zip(input) {
+        if !u.is_finite() {
+            return None;
+        }
+        *register = *u;
+    }
+    Some(())
+}
+
+/// What the outputs of a step lead to, beside the state.
+#[inline(never)]
+fn stage<S: Scalar>(state: &mut PredictorState<S>, layout: &Layout, outputs: usize) -> Option<()> {
+    let outputs = state.outputs.get(..outputs)?;
+    state.history.stage(layout, outputs, &mut state.next)
 }
 
 /// The first observable outside its range.
@@ -331,18 +570,6 @@ fn first_outside<S: Scalar>(
         let raw = registers.get(*register);
         !(raw >= *low && raw <= *high)
     })
-}
-
-/// The outputs of a dense model.
-#[inline(never)]
-fn dense<S: Scalar>(dictionary: &Dictionary, values: &[S], coefficients: &[S], outputs: &mut [S]) {
-    outputs.fill(S::ZERO);
-    let (stride, mut scratch) = (dictionary.dense_terms(), Scratch::new());
-    let mut coefficients = coefficients;
-    for (_, factors) in dictionary.blocks() {
-        let used = contract(factors, values, coefficients, stride, outputs, &mut scratch);
-        coefficients = coefficients.get(used..).unwrap_or(&[]);
-    }
 }
 
 #[inline(never)]

@@ -6,10 +6,13 @@
 //! |---|---|
 //! | 0 | the constant 1 |
 //! | 1 | nothing |
-//! | 2 … | the inputs of the step to be predicted, in order |
-//! | then | the present sample, four per coordinate: itself, its change since the sample before, sine, cosine |
+//! | 2 … | the inputs of the step to be predicted, in order, and the present sample |
 //! | then | *delay lines*: what is observed of earlier samples, each source at consecutive samples, the newest first; padded to a multiple of four |
 //! | then | what a step computes: standardised observables, functions and terms ([`kernel`](crate::kernel)) |
+//!
+//! Where there are delay lines, the inputs come first, and then the present sample with four registers per
+//! coordinate: itself, its change since the sample before, sine, cosine. Where there are none, what is
+//! observed comes first, in the order of the observables, so that a kernel loads it at once.
 //!
 //! All delay lines move on by one sample when all their registers are moved up by one: the last of a
 //! line falls onto the head of the next line, which is then written anew, from the present sample or
@@ -28,15 +31,18 @@ use crate::model::{Space, State, Symmetry, Target};
 pub(crate) const ONE: u8 = 0;
 /// Register that nothing uses.
 pub(crate) const NOWHERE: u8 = 1;
-/// Register of the first input.
-pub(crate) const INPUTS: u8 = 2;
+/// The first register of inputs and present sample.
+pub(crate) const FIRST: u8 = 2;
 /// Registers of a coordinate in the present sample, and registers of the delay lines that are moved at
 /// once: what a Cortex-M loads and stores with one instruction each.
 pub(crate) const GROUP: usize = 4;
 /// Where they are among the four of a coordinate.
-pub(crate) const CHANGE: u8 = 1;
-pub(crate) const SIN: u8 = 2;
-pub(crate) const COS: u8 = 3;
+const CHANGE: u8 = 1;
+const SIN: u8 = 2;
+const COS: u8 = 3;
+
+/// The registers from [`FIRST`] on.
+pub(crate) type FromFirst<S> = [S; REGISTERS - FIRST as usize];
 
 /// The registers.
 #[derive(Clone, Debug)]
@@ -75,16 +81,23 @@ impl<S: Scalar> Registers<S> {
         rest.get_mut(..count).unwrap_or_default()
     }
 
-    /// The registers, to be read and written in one loop.
+    /// All that a step uses.
     #[inline(always)]
-    pub(crate) fn cells(&mut self) -> Cells<'_, S> {
-        Cells(Cell::from_mut(&mut self.0).as_array_of_cells())
+    pub(crate) fn all_mut(&mut self) -> &mut FromFirst<S> {
+        let [_, _, rest @ ..] = &mut self.0;
+        rest
     }
 
-    /// The present sample.
+    /// The registers before one, and from it on.
     #[inline(always)]
-    pub(crate) fn present(&self, layout: &Layout) -> &[[S; GROUP]] {
-        self.0.get(usize::from(layout.present)..).unwrap_or_default().as_chunks().0
+    pub(crate) fn split_at_mut(&mut self, register: u8) -> (&mut [S], &mut [S]) {
+        self.0.split_at_mut_checked(usize::from(register)).unwrap_or_default()
+    }
+
+    /// The registers, to be read and written in one loop.
+    #[inline(always)]
+    pub(crate) fn cells(&mut self) -> &[Cell<S>; REGISTERS] {
+        Cell::from_mut(&mut self.0).as_array_of_cells()
     }
 
     /// Moves on by one sample: delay lines, and then the present sample.
@@ -102,28 +115,21 @@ impl<S: Scalar> Registers<S> {
         for [head, from] in &layout.heads {
             self.set(*head, self.get(*from));
         }
-        let present = self.0.get_mut(usize::from(layout.present)..).unwrap_or_default();
+        if !layout.grouped {
+            for (place, [x, change, sin, cos]) in layout.states.iter().zip(next) {
+                self.set(place.x, *x);
+                self.set(place.change, *change);
+                self.set(place.sin, *sin);
+                self.set(place.cos, *cos);
+            }
+            return;
+        }
+        let present = layout.states.first().map_or(NOWHERE, |place| place.x);
+        let present = self.0.get_mut(usize::from(present)..).unwrap_or_default();
         let (present, _) = present.as_chunks_mut::<GROUP>();
         for ((to, from), _) in present.iter_mut().zip(next).zip(&layout.states) {
             *to = *from;
         }
-    }
-}
-
-/// All registers, each to be read and written.
-#[derive(Clone, Copy)]
-pub(crate) struct Cells<'r, S>(&'r [Cell<S>; REGISTERS]);
-
-impl<'r, S: Scalar> Cells<'r, S> {
-    #[inline(always)]
-    pub(crate) fn get(self, register: u8) -> S {
-        self.0.get(usize::from(register)).map_or(S::ZERO, Cell::get)
-    }
-
-    /// `count` registers from `first` on, as far as there are.
-    #[inline(always)]
-    pub(crate) fn slice(self, first: u8, count: usize) -> &'r [Cell<S>] {
-        self.0.get(usize::from(first)..).and_then(|rest| rest.get(..count)).unwrap_or(&[])
     }
 }
 
@@ -155,12 +161,50 @@ impl Kind {
     }
 }
 
-/// What becomes of a coordinate's outputs, and its limits.
+/// What becomes of a coordinate's outputs, its limits, and its registers in the present sample:
+/// [`NOWHERE`] for what nobody reads.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Place {
     pub(crate) kind: Kind,
+    pub(crate) x: u8,
+    pub(crate) change: u8,
+    pub(crate) sin: u8,
+    pub(crate) cos: u8,
     /// Limits of the coordinate, finite: what is within them is finite.
     pub(crate) limit: [f32; 2],
+}
+
+impl Place {
+    /// Of coordinate `i`: whether its changes are observed, and its sine and cosine needed.
+    #[inline(always)]
+    fn of(
+        i: u8,
+        state: &State<'_>,
+        symmetry: Symmetry,
+        changes: bool,
+        trigonometric: bool,
+    ) -> Self {
+        let [low, high] = state.limit;
+        let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
+        let kind = match (state.target, state.space) {
+            (Target::Absolute, Space::Line) => Kind::Line,
+            (Target::Increment, Space::Line) => match symmetry {
+                Symmetry::Se2 { x, y, .. } if x == i || y == i => Kind::Pose,
+                _ => Kind::Increment,
+            },
+            (Target::Absolute, Space::Circle) if limited || changes => Kind::Angle,
+            (Target::Absolute, Space::Circle) => Kind::Circle,
+            (Target::Increment, Space::Circle) if trigonometric => {
+                Kind::AngleIncrementTrigonometric
+            }
+            (Target::Increment, Space::Circle) => Kind::AngleIncrement,
+        };
+        // Limits are no NaN.
+        let low = if low > f32::MIN { low } else { f32::MIN };
+        let high = if high < f32::MAX { high } else { f32::MAX };
+        let limit = [low, high];
+        Self { kind, limit, x: NOWHERE, change: NOWHERE, sin: NOWHERE, cos: NOWHERE }
+    }
 }
 
 /// Where the pose of an se(2)-symmetric model is.
@@ -192,19 +236,21 @@ pub(crate) struct Layout {
     /// Changes of coordinates are observed.
     pub(crate) increments: bool,
     inputs: u8,
-    /// The first register of the present sample.
-    pub(crate) present: u8,
+    /// Register of the first input.
+    pub(crate) first_input: u8,
+    /// The present sample has four consecutive registers per coordinate.
+    grouped: bool,
     /// The first register of the delay lines, and how many groups they are.
     pub(crate) lines: u8,
     pub(crate) groups: u8,
     /// The first register behind the history.
     pub(crate) end: u8,
-    /// Differs between layouts that keep different things, or keep them elsewhere.
+    /// Differs between layouts that keep different things, or keep them elsewhere; 0 is that of nothing.
     pub(crate) id: u32,
 }
 
 /// Registers that a history needs at most: of an angle its sine, cosine and changes are delayed.
-const HISTORY: usize = INPUTS as usize
+const HISTORY: usize = FIRST as usize
     + MAX_INPUTS
     + MAX_STATES * (GROUP + 2 * MAX_LAG + MAX_LAG - 1)
     + MAX_INPUTS * MAX_LAG
@@ -212,109 +258,197 @@ const HISTORY: usize = INPUTS as usize
 const _: () = assert!(HISTORY < REGISTERS, "no index of a register that keeps something overflows");
 
 impl Layout {
-    /// Of a checked structure; `trigonometric` has a bit per coordinate whose sine and cosine are
-    /// needed.
-    pub(crate) fn new(
+    /// Of nothing.
+    pub(crate) const fn empty() -> Self {
+        Self {
+            observables: Vec::new(),
+            states: Vec::new(),
+            pose: None,
+            heads: Vec::new(),
+            increments: false,
+            inputs: 0,
+            first_input: FIRST,
+            grouped: false,
+            lines: FIRST,
+            groups: 0,
+            end: FIRST,
+            id: 0,
+        }
+    }
+
+    pub(crate) fn clear(&mut self) {
+        self.observables.clear();
+        self.states.clear();
+        self.heads.clear();
+        (self.pose, self.increments, self.inputs) = (None, false, 0);
+        (self.first_input, self.grouped) = (FIRST, false);
+        (self.lines, self.groups, self.end) = (FIRST, 0, FIRST);
+        self.id = 0;
+    }
+
+    /// Becomes that of a checked structure; bit i of `trigonometric`: the sine and cosine of coordinate i
+    /// are needed. It is made where it lies, part by part: it would be a quarter of a kilobyte of stack.
+    #[inline(always)]
+    pub(crate) fn fill(
+        &mut self,
         states: &[State<'_>],
         inputs: usize,
         symmetry: Symmetry,
         observables: &[Observable],
-        trigonometric: impl Fn(usize) -> bool,
-    ) -> Self {
-        let observed = |source| observables.iter().any(|o| o.source == source);
-        let places = (0..).zip(states.iter().take(MAX_STATES)).map(|(i, state)| {
-            let [low, high] = state.limit;
-            let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
-            let kind = match (state.target, state.space) {
-                (Target::Absolute, Space::Line) => Kind::Line,
-                (Target::Increment, Space::Line) => match symmetry {
-                    Symmetry::Se2 { x, y, .. } if x == i || y == i => Kind::Pose,
-                    _ => Kind::Increment,
-                },
-                (Target::Absolute, Space::Circle) => {
-                    match limited || observed(Source::Increment(i)) {
-                        true => Kind::Angle,
-                        false => Kind::Circle,
-                    }
-                }
-                (Target::Increment, Space::Circle) => match trigonometric(i.into()) {
-                    true => Kind::AngleIncrementTrigonometric,
-                    false => Kind::AngleIncrement,
-                },
-            };
-            Place { kind, limit: [low.max(f32::MIN), high.min(f32::MAX)] }
-        });
-        let places: Vec<Place, MAX_STATES> = places.collect();
-        let present = INPUTS.saturating_add(inputs as u8);
-        let coordinate = |i: u8| present.saturating_add(i.saturating_mul(GROUP as u8));
+        trigonometric: u8,
+    ) {
+        self.inputs = inputs as u8;
+        self.increments = observables.iter().any(|o| matches!(o.source, Source::Increment(_)));
+        self.place_states(states, symmetry, observables, trigonometric);
+        let next = self.place_present(observables, trigonometric);
+        self.place_lines(observables, next);
+        self.pose = self.place_pose(symmetry);
+        self.identify(trigonometric);
+    }
 
-        // The register of a source at its latest sample, and the lag of that sample.
-        let latest = |source: Source| match source {
-            Source::State(i) => (coordinate(i), 0),
-            Source::Sin(i) => (coordinate(i).saturating_add(SIN), 0),
-            Source::Cos(i) => (coordinate(i).saturating_add(COS), 0),
-            Source::Increment(i) => (coordinate(i).saturating_add(CHANGE), 1),
-            Source::Input(i) => (INPUTS.saturating_add(i), 0),
+    /// FNV-1a of what two layouts that keep the same have in common.
+    #[inline(never)]
+    fn identify(&mut self, trigonometric: u8) {
+        let Self { first_input, lines, groups, .. } = *self;
+        let bytes = self.heads.iter().flatten().copied().chain([first_input, lines, groups]);
+        let places = self.states.iter().flat_map(|p| [p.x, p.change, p.sin, p.cos]);
+        let bytes = bytes.chain(places);
+        let trigonometric = (0..self.states.len()).map(|i| (trigonometric >> i) & 1);
+        self.id = bytes
+            .chain(trigonometric)
+            .fold(0x811C_9DC5, |id: u32, byte| (id ^ u32::from(byte)).wrapping_mul(0x0100_0193))
+            .max(1);
+    }
+
+    /// What becomes of the coordinates.
+    #[inline(never)]
+    fn place_states(
+        &mut self,
+        states: &[State<'_>],
+        symmetry: Symmetry,
+        observables: &[Observable],
+        trigonometric: u8,
+    ) {
+        self.states.clear();
+        for (i, state) in (0_u8..).zip(states) {
+            let changes = observables.iter().any(|o| o.source == Source::Increment(i));
+            let place = Place::of(i, state, symmetry, changes, (trigonometric >> i) & 1 != 0);
+            let _ = self.states.push(place);
+        }
+    }
+
+    /// Where the inputs are, and the present sample; the first register behind them.
+    #[inline(never)]
+    fn place_present(&mut self, observables: &[Observable], trigonometric: u8) -> u8 {
+        let mut next = FIRST;
+        let mut take = |count: u8| {
+            let first = next;
+            next = next.saturating_add(count);
+            first
         };
-        let lines = coordinate(places.len() as u8);
-        let mut next = lines;
-        // The first register of the line of every source.
-        let mut heads: Vec<[u8; 2], LINES> = Vec::new();
-        let mut registers: Vec<u8, MAX_OBSERVABLES> = Vec::new();
+        let latest = |source: Source| u8::from(matches!(source, Source::Increment(_)));
+        self.grouped = observables.iter().any(|o| o.lag > latest(o.source));
+        self.first_input = NOWHERE;
+        if self.grouped {
+            self.first_input = take(self.inputs);
+            for place in &mut self.states {
+                let first = take(GROUP as u8);
+                let at = |offset| first.saturating_add(offset);
+                (place.x, place.change, place.sin, place.cos) =
+                    (first, at(CHANGE), at(SIN), at(COS));
+            }
+            return next;
+        }
         for o in observables {
-            let (from, lag) = latest(o.source);
+            let (i, of): (u8, fn(&mut Place) -> &mut u8) = match o.source {
+                Source::Input(_) => {
+                    if self.first_input == NOWHERE {
+                        self.first_input = take(self.inputs);
+                    }
+                    continue;
+                }
+                Source::State(i) => (i, |place| &mut place.x),
+                Source::Sin(i) => (i, |place| &mut place.sin),
+                Source::Cos(i) => (i, |place| &mut place.cos),
+                Source::Increment(i) => (i, |place| &mut place.change),
+            };
+            if let Some(place) = self.states.get_mut(usize::from(i)) {
+                *of(place) = take(1);
+            }
+        }
+        if self.first_input == NOWHERE {
+            self.first_input = take(self.inputs);
+        }
+        for (i, place) in self.states.iter_mut().enumerate() {
+            if !place.kind.absolute_angle() && place.x == NOWHERE {
+                place.x = take(1);
+            }
+            let needed = (trigonometric >> i) & 1 != 0;
+            for register in [&mut place.sin, &mut place.cos] {
+                if needed && *register == NOWHERE {
+                    *register = take(1);
+                }
+            }
+        }
+        next
+    }
+
+    /// The register of a source at its latest sample, and the lag of that sample.
+    fn latest(&self, source: Source) -> (u8, u8) {
+        match source {
+            Source::State(i) => (self.place(i).x, 0),
+            Source::Sin(i) => (self.place(i).sin, 0),
+            Source::Cos(i) => (self.place(i).cos, 0),
+            Source::Increment(i) => (self.place(i).change, 1),
+            Source::Input(i) => (self.first_input.saturating_add(i), 0),
+        }
+    }
+
+    /// The delay lines, and the register of every observable.
+    #[inline(never)]
+    fn place_lines(&mut self, observables: &[Observable], first: u8) {
+        self.lines = first;
+        let mut next = first;
+        self.heads.clear();
+        self.observables.clear();
+        for o in observables {
+            let (from, lag) = self.latest(o.source);
             if o.lag <= lag {
-                let _ = registers.push(from);
+                let _ = self.observables.push(from);
                 continue;
             }
-            let head = match heads.iter().find(|[_, source]| *source == from) {
+            // The first register of the line of its source.
+            let head = match self.heads.iter().find(|[_, source]| *source == from) {
                 Some([head, _]) => *head,
                 None => {
                     let own = observables.iter().filter(|other| other.source == o.source);
                     let oldest = own.map(|o| o.lag).max().unwrap_or(lag);
-                    let _ = heads.push([next, from]);
+                    let _ = self.heads.push([next, from]);
                     let head = next;
                     next = next.saturating_add(oldest.saturating_sub(lag));
                     head
                 }
             };
-            let _ =
-                registers.push(head.saturating_add(o.lag.saturating_sub(lag)).saturating_sub(1));
+            let register = head.saturating_add(o.lag.saturating_sub(lag)).saturating_sub(1);
+            let _ = self.observables.push(register);
         }
-        let groups = next.saturating_sub(lines).div_ceil(GROUP as u8);
-        let pose = match symmetry {
-            Symmetry::Se2 { x, y, heading } => {
-                // An absolute angle has two outputs.
-                let output = |coordinate: u8| {
-                    places.iter().take(coordinate.into()).fold(0_u8, |sum, place| {
-                        sum.saturating_add(1).saturating_add(place.kind.absolute_angle().into())
-                    })
-                };
-                let ((sin, _), (cos, _)) =
-                    (latest(Source::Sin(heading)), latest(Source::Cos(heading)));
-                Some(Pose { x, y, ahead: output(x), left: output(y), sin, cos })
-            }
-            _ => None,
+        self.groups = next.saturating_sub(self.lines).div_ceil(GROUP as u8);
+        self.end = self.lines.saturating_add(self.groups.saturating_mul(GROUP as u8));
+    }
+
+    /// Where the pose is, if the symmetry has one.
+    #[inline(never)]
+    fn place_pose(&self, symmetry: Symmetry) -> Option<Pose> {
+        let Symmetry::Se2 { x, y, heading } = symmetry else { return None };
+        // An absolute angle has two outputs.
+        let output = |coordinate: u8| {
+            self.states.iter().take(coordinate.into()).fold(0_u8, |sum, place| {
+                sum.saturating_add(1).saturating_add(place.kind.absolute_angle().into())
+            })
         };
-        let bytes = heads.iter().flatten().copied().chain([present, lines, groups]);
-        let trigonometric = (0..places.len()).map(|i| trigonometric(i).into());
-        // FNV-1a.
-        let id = bytes
-            .chain(trigonometric)
-            .fold(0x811C_9DC5, |id: u32, byte| (id ^ u32::from(byte)).wrapping_mul(0x0100_0193));
-        Self {
-            observables: registers,
-            states: places,
-            pose,
-            heads,
-            increments: (0..states.len() as u8).any(|i| observed(Source::Increment(i))),
-            inputs: inputs as u8,
-            present,
-            lines,
-            groups,
-            end: lines.saturating_add(groups.saturating_mul(GROUP as u8)),
-            id,
-        }
+        let ((sin, _), (cos, _)) =
+            (self.latest(Source::Sin(heading)), self.latest(Source::Cos(heading)));
+        Some(Pose { x, y, ahead: output(x), left: output(y), sin, cos })
     }
 
     /// Inputs of the model.
@@ -325,13 +459,15 @@ impl Layout {
 
     /// What becomes of a coordinate that a checked structure has.
     #[inline]
-    pub(crate) fn kind(&self, coordinate: u8) -> Kind {
-        self.states.get(usize::from(coordinate)).map(|place| place.kind).unwrap_or_default()
+    pub(crate) fn place(&self, coordinate: u8) -> Place {
+        self.states.get(usize::from(coordinate)).copied().unwrap_or_default()
     }
 
-    /// The registers that a history keeps: the first, and how many.
+    /// The registers that a history keeps: those before the inputs and those behind them, each the first
+    /// and how many.
     #[inline]
-    pub(crate) fn kept(&self) -> (u8, u8) {
-        (self.present, self.end.saturating_sub(self.present))
+    pub(crate) fn kept(&self) -> [(u8, u8); 2] {
+        let behind = self.first_input.saturating_add(self.inputs);
+        [(FIRST, self.first_input.saturating_sub(FIRST)), (behind, self.end.saturating_sub(behind))]
     }
 }

@@ -3,10 +3,149 @@
 use core::fmt::Debug;
 use core::ops::{Add, Div, Mul, Neg, Sub};
 
+use crate::kernel::{Run, fold_portable};
+#[cfg(cortex_m4f)]
+use crate::kernel::{cortex_m4f, fold_axis};
+
+/// The square of the length of (sin, cos) has to be from the first to below the second one, or their direction
+/// means nothing.
+pub(crate) const SHORTEST: f32 = 1.0 / LONGEST;
+pub(crate) const LONGEST: f32 = (1 << 20) as f32;
+
 mod sealed {
-    pub trait Sealed {}
-    impl Sealed for f32 {}
-    impl Sealed for f64 {}
+    use core::cell::Cell;
+
+    use crate::capacity::REGISTERS;
+    use crate::kernel::Constants;
+    use crate::registers::FromFirst;
+
+    pub trait Sealed: Sized {
+        /// A step of a planar pose from its ranges and coefficients; its registers begin with the two inputs and x, y, heading, its sine and
+        /// cosine: as [`drive`](Self::drive).
+        #[inline(always)]
+        fn planar(
+            _: &Constants,
+            _: &[[Self; 2]; 2],
+            _: &[Self; 48],
+            _: &mut FromFirst<Self>,
+        ) -> bool {
+            false
+        }
+
+        /// The same from the outputs that inputs lead to, which are held.
+        #[inline(always)]
+        fn planar_held(_: &Constants, _pose: &mut [Self; 5], _outputs: &[Self; 3]) -> bool {
+            false
+        }
+
+        /// The terms of a sparse model, products of registers, and its first outputs, up to four.
+        fn terms(
+            registers: &[Cell<Self>; REGISTERS],
+            products: &[[u8; 2]],
+            made: &[Cell<Self>],
+            coefficients: &[Self],
+            outputs: &mut [Self],
+        );
+
+        /// A step of the paper's drive from its ranges and coefficients; its registers begin with the present sample and the inputs: whether
+        /// it was made. Nothing has changed if not, as on machines without a kernel for it.
+        #[inline(always)]
+        fn drive(
+            _: &Constants,
+            _: &[[Self; 2]; 6],
+            _: &[Self; 256],
+            _: &mut FromFirst<Self>,
+        ) -> bool {
+            false
+        }
+
+        /// The same with the inputs held, from what they have left of the coefficients.
+        #[inline(always)]
+        fn drive_held(
+            _: &Constants,
+            _ranges: &[[Self; 2]; 6],
+            _present: &mut [Self; 4],
+            _held: &[Self; 64],
+        ) -> bool {
+            false
+        }
+    }
+    impl Sealed for f32 {
+        #[cfg(cortex_m4f)]
+        #[inline(always)]
+        fn planar(
+            constants: &Constants,
+            ranges: &[[f32; 2]; 2],
+            coefficients: &[f32; 48],
+            registers: &mut FromFirst<f32>,
+        ) -> bool {
+            crate::kernel::cortex_m4f::planar(constants, ranges, coefficients, registers)
+        }
+
+        #[cfg(cortex_m4f)]
+        #[inline(always)]
+        fn planar_held(constants: &Constants, pose: &mut [f32; 5], outputs: &[f32; 3]) -> bool {
+            crate::kernel::cortex_m4f::planar_held(constants, pose, outputs)
+        }
+
+        #[cfg(cortex_m4f)]
+        #[inline(always)]
+        fn terms(
+            registers: &[Cell<f32>; REGISTERS],
+            products: &[[u8; 2]],
+            made: &[Cell<f32>],
+            coefficients: &[f32],
+            outputs: &mut [f32],
+        ) {
+            crate::kernel::cortex_m4f::terms(registers, products, made, coefficients, outputs);
+        }
+
+        #[cfg(not(cortex_m4f))]
+        #[inline(always)]
+        fn terms(
+            registers: &[Cell<f32>; REGISTERS],
+            products: &[[u8; 2]],
+            made: &[Cell<f32>],
+            coefficients: &[f32],
+            outputs: &mut [f32],
+        ) {
+            crate::kernel::terms(registers, products, made, coefficients, outputs);
+        }
+
+        #[cfg(cortex_m4f)]
+        #[inline(always)]
+        fn drive(
+            constants: &Constants,
+            ranges: &[[f32; 2]; 6],
+            coefficients: &[f32; 256],
+            registers: &mut FromFirst<f32>,
+        ) -> bool {
+            crate::kernel::cortex_m4f::drive(constants, ranges, coefficients, registers)
+        }
+
+        #[cfg(cortex_m4f)]
+        #[inline(always)]
+        fn drive_held(
+            constants: &Constants,
+            ranges: &[[f32; 2]; 6],
+            present: &mut [f32; 4],
+            held: &[f32; 64],
+        ) -> bool {
+            crate::kernel::cortex_m4f::drive_held(constants, ranges, present, held)
+        }
+    }
+    impl Sealed for f64 {
+        #[inline(always)]
+        fn terms(
+            registers: &[Cell<f64>; REGISTERS],
+            products: &[[u8; 2]],
+            made: &[Cell<f64>],
+            coefficients: &[f64],
+            outputs: &mut [f64],
+        ) {
+            crate::kernel::terms(registers, products, made, coefficients, outputs);
+        }
+    }
 }
 
 /// What the lift needs of a number: addition, subtraction, multiplication.
@@ -86,9 +225,8 @@ pub trait Scalar:
     /// The angle of the point `(x, self)`, in \[−π, π\]: −π just below the negative axis, where the angle
     /// rounds to it.
     fn atan2(self, x: Self) -> Self;
-    /// One over the square root of a positive number; in `f32` with a relative error of at most
-    /// 2.4e-7.
-    fn reciprocal_root(self) -> Self;
+    /// The square root, rounded correctly.
+    fn root(self) -> Self;
     /// What the division towards zero leaves over, exact, with the sign of `self`.
     fn rem(self, divisor: Self) -> Self;
     /// Absolute value.
@@ -99,6 +237,41 @@ pub trait Scalar:
     /// difference is negative, and not rounded to 0, exactly if the first number is smaller. It may
     /// also be set where infinite numbers are equal.
     fn outside(self, low: Self, high: Self) -> u32;
+
+    /// Puts sine and cosine back on the circle, one rounded square root and one quotient for both; `false`,
+    /// and nothing done, if they are a thousand times too long or too short, or not finite.
+    #[inline]
+    fn on_circle(pair: &mut [Self; 2]) -> bool {
+        let [s, c] = *pair;
+        let square = s * s + c * c;
+        if !(square >= Self::from_f32(SHORTEST) && square < Self::from_f32(LONGEST)) {
+            return false;
+        }
+        let shrink = Self::ONE / square.root();
+        *pair = [s * shrink, c * shrink];
+        true
+    }
+
+    /// Scales the values of observables, `v = (raw − centre) · gain`, and compares them with their ranges:
+    /// whether all are inside. `raw` has shape `[n]`, `ranges` shape `[n, 2]`, `scales` with centre and gain
+    /// shape `[n, 2]`, `v` shape `[n]`.
+    #[inline]
+    fn observe(raw: &[Self], ranges: &[[Self; 2]], scales: &[[f32; 2]], v: &mut [Self]) -> bool {
+        let mut inside = true;
+        for (((to, raw), [low, high]), [centre, gain]) in
+            v.iter_mut().zip(raw).zip(ranges).zip(scales)
+        {
+            inside &= *raw >= *low && *raw <= *high;
+            *to = (*raw - Self::from_f32(*centre)) * Self::from_f32(*gain);
+        }
+        inside
+    }
+
+    /// [`kernel::fold`](crate::kernel::fold): the same bits as [`fold_portable`], whatever the machine.
+    #[inline]
+    fn fold(run: Run, from: &[Self], to: &mut [Self], v: &[Self]) {
+        fold_portable(run, from, to, v);
+    }
 
     /// The same angle in (−π, π] \[rad\].
     ///
@@ -141,14 +314,14 @@ impl Number for f64 {
 }
 
 /// 1.5 · 2²³: added to a small number, it leaves it rounded to an integer in the last bits.
-const ROUND: f32 = 12_582_912.0;
+pub(crate) const ROUND: f32 = 12_582_912.0;
 /// π/2 in two parts; up to two of the first are exact, and so is taking them away from an angle.
-const HALF_PI: [f32; 2] = [core::f32::consts::FRAC_PI_2, -4.371_139e-8];
+pub(crate) const HALF_PI: [f32; 2] = [core::f32::consts::FRAC_PI_2, -4.371_139e-8];
 /// (sin x − x) / x³ in x², highest power first, for |x| ≤ π/4. This and the next two are Moshier's
 /// minimax polynomials (Cephes, `sinf.c` and `atanf.c`).
-const SIN: [f32; 3] = [-1.951_529_6e-4, 8.332_161e-3, -1.666_665_5e-1];
+pub(crate) const SIN: [f32; 3] = [-1.951_529_6e-4, 8.332_161e-3, -1.666_665_5e-1];
 /// (cos x − 1 + x²/2) / x⁴ in x², highest power first, for |x| ≤ π/4.
-const COS: [f32; 3] = [2.443_315_7e-5, -1.388_731_6e-3, 4.166_664_6e-2];
+pub(crate) const COS: [f32; 3] = [2.443_315_7e-5, -1.388_731_6e-3, 4.166_664_6e-2];
 /// (arctan x − x) / x³ in x², highest power first, for |x| ≤ tan π/8.
 const ATAN: [f32; 4] = [8.053_744_5e-2, -1.387_768_6e-1, 1.997_771_1e-1, -3.333_295e-1];
 /// tan π/8
@@ -202,17 +375,30 @@ impl Scalar for f32 {
         if self < 0.0 { -angle } else { angle }
     }
     #[inline]
-    fn reciprocal_root(self) -> Self {
-        // A guess to 3.5 % from the exponent; every round of Newton's method squares the error.
-        let half = 0.5 * self;
-        let root = f32::from_bits(0x5F37_59DF_u32.wrapping_sub(self.to_bits() >> 1));
-        let root = root * (1.5 - half * root * root);
-        let root = root * (1.5 - half * root * root);
-        root * (1.5 - half * root * root)
+    fn root(self) -> Self {
+        libm::sqrtf(self)
     }
+    // A difference at a time, each of them exact. libm's divides integers of 64 bits, which is a kilobyte
+    // of a controller's flash.
     #[inline]
     fn rem(self, divisor: Self) -> Self {
-        libm::fmodf(self, divisor)
+        let (mut rest, divisor) = (self.abs(), divisor.abs());
+        if !(rest.is_finite() && divisor > 0.0) {
+            return f32::NAN;
+        }
+        let mut step = divisor;
+        while step <= rest * 0.5 {
+            step += step;
+        }
+        loop {
+            if rest >= step {
+                rest -= step;
+            }
+            if step <= divisor {
+                return rest.copysign(self);
+            }
+            step *= 0.5;
+        }
     }
     #[inline]
     fn abs(self) -> Self {
@@ -225,6 +411,23 @@ impl Scalar for f32 {
     #[inline]
     fn outside(self, low: Self, high: Self) -> u32 {
         (self - low).to_bits() | (high - self).to_bits()
+    }
+    #[cfg(cortex_m4f)]
+    #[inline]
+    fn fold(run: Run, from: &[Self], to: &mut [Self], v: &[Self]) {
+        if !cortex_m4f::fold(run, from, to, v) {
+            fold_axis(run, from, to, v);
+        }
+    }
+    #[cfg(cortex_m4f)]
+    #[inline]
+    fn observe(raw: &[Self], ranges: &[[Self; 2]], scales: &[[f32; 2]], v: &mut [Self]) -> bool {
+        cortex_m4f::observe(raw, ranges, scales, v)
+    }
+    #[cfg(cortex_m4f)]
+    #[inline]
+    fn on_circle(pair: &mut [Self; 2]) -> bool {
+        cortex_m4f::on_circle(pair)
     }
 }
 
@@ -249,8 +452,8 @@ impl Scalar for f64 {
         libm::atan2(self, x)
     }
     #[inline]
-    fn reciprocal_root(self) -> Self {
-        1.0 / libm::sqrt(self)
+    fn root(self) -> Self {
+        libm::sqrt(self)
     }
     #[inline]
     fn rem(self, divisor: Self) -> Self {

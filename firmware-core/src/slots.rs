@@ -81,13 +81,12 @@
 //! assert_eq!(slots.floor(), 7);
 //! ```
 
-use core::cmp::Reverse;
-
 use embedded_storage::nor_flash::{NorFlash, ReadNorFlash};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::blob::CRC;
+use crate::blob::crc32;
+use crate::encoding::{ReadError, Reader, Writer};
 
 /// First bytes of a slot with a header.
 pub const MAGIC: [u8; 4] = *b"SLOT";
@@ -117,12 +116,26 @@ const _: () = assert!(RECORD == HEADER + 4 * 2 * CELL && BUFFER.is_multiple_of(C
 /// assert_eq!(firmware_core::slots::robot("rosbot"), 0x6B9E_3F84);
 /// ```
 pub fn robot(name: &str) -> u32 {
-    CRC.checksum(name.as_bytes())
+    crc32(0, name.as_bytes())
 }
 
 /// The hash of a payload, as in a header.
 pub fn sha256(payload: &[u8]) -> [u8; 32] {
-    Sha256::digest(payload).into()
+    let mut digest = Sha256::new();
+    feed(&mut digest, payload);
+    finish(digest)
+}
+
+// Once each: where they are called they would be part of the code.
+
+#[inline(never)]
+fn feed(digest: &mut Sha256, part: &[u8]) {
+    digest.update(part);
+}
+
+#[inline(never)]
+fn finish(digest: Sha256) -> [u8; 32] {
+    digest.finalize().into()
 }
 
 /// Where the slots lie in the flash.
@@ -282,6 +295,21 @@ impl Release {
     }
 }
 
+impl Release {
+    /// As postcard has it.
+    pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self, ReadError> {
+        let (length, sha256) = (reader.word()?, reader.array()?);
+        Ok(Self { length, sha256, sequence: reader.word()?, robot: reader.word()? })
+    }
+
+    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
+        to.word(self.length);
+        to.array(&self.sha256);
+        to.word(self.sequence);
+        to.word(self.robot);
+    }
+}
+
 /// Why an update does not begin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -399,7 +427,7 @@ impl Header {
         put(&self.sha256);
         put(&[0; 4]);
         if let Some((body, check)) = bytes.split_last_chunk_mut::<4>() {
-            *check = CRC.checksum(body).to_le_bytes();
+            *check = crc32(0, body).to_le_bytes();
         }
         bytes
     }
@@ -432,7 +460,7 @@ struct Unreadable;
 
 /// CRC-32 of a header's bytes but the last four.
 fn check_of(header: &[u8]) -> u32 {
-    CRC.checksum(header.split_last_chunk::<4>().map_or(&[], |(body, _)| body))
+    crc32(0, header.split_last_chunk::<4>().map_or(&[], |(body, _)| body))
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -526,6 +554,7 @@ enum State {
 }
 
 impl Record {
+    #[inline(never)]
     fn state(&self) -> State {
         if self.rejected.erased < 2 {
             State::Rejected
@@ -544,6 +573,11 @@ impl Record {
     fn rank(&self) -> (u32, u32) {
         (self.header.sequence, self.header.generation)
     }
+}
+
+/// That of a slot that can be read.
+fn state<E>(record: &Result<Record, E>) -> Option<State> {
+    record.as_ref().ok().map(Record::state)
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -600,6 +634,7 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`GeometryError`] for slots that there cannot be on this flash.
+    #[inline(always)]
     pub fn boot(
         flash: F,
         geometry: Geometry,
@@ -611,49 +646,53 @@ impl<F: NorFlash> Slots<F> {
         let robot = self::robot(robot);
         let (running, trial, update) = (None, false, None);
         let mut slots = Self { flash, geometry, robot, floor: lowest, running, trial, update };
-        let records = Side::BOTH.map(|side| slots.settled(side));
-        let state = |record: &Result<Record, _>| record.as_ref().ok().map(Record::state);
-        for record in records.iter().flatten() {
+        let mut records = Side::BOTH.map(|side| (side, slots.settled(side)));
+        for (_, record) in &records {
             // What another robot's firmware left behind says nothing about this one.
-            if record.state() == State::Confirmed && record.header.robot == robot {
-                slots.floor = slots.floor.max(record.header.sequence);
+            if let Ok(Record { header, .. }) = record
+                && state(record) == Some(State::Confirmed)
+                && header.robot == robot
+            {
+                slots.floor = slots.floor.max(header.sequence);
             }
         }
-
-        let [a, b] = records;
         // Fresh ones before confirmed ones, the newest first.
+        let [a, b] = &records;
         let key = |record: &Result<Record, _>| {
             let generation = record.as_ref().map_or(0, |record| record.header.generation);
-            Reverse((state(record) == Some(State::Fresh), generation))
+            (state(record) == Some(State::Fresh), generation)
         };
-        let mut candidates = [(Side::A, a), (Side::B, b)];
-        candidates.sort_unstable_by_key(|(_, record)| key(record));
+        if key(&b.1) > key(&a.1) {
+            records.reverse();
+        }
 
         let (running, floor, refused) = (Which::Factory, slots.floor, [None, None]);
         let mut boot = Boot { running, payload: None, trial, floor, refused };
-        for (side, record) in candidates {
-            if boot.payload.is_some() && record.is_ok() {
-                continue;
-            }
-            match record.and_then(|record| slots.try_run(side, &record, &mut accept)) {
-                Ok(payload) => {
-                    boot.running = payload.slot;
-                    boot.payload = Some(payload);
-                    boot.trial = slots.trial;
-                }
-                Err(refusal) => {
-                    let [a, b] = &mut boot.refused;
-                    *match side {
-                        Side::A => a,
-                        Side::B => b,
-                    } = Some(refusal);
-                }
-            }
+        for (side, record) in records {
+            let refusal = match record {
+                Ok(_) if boot.payload.is_some() => continue,
+                Ok(record) => match slots.try_run(side, &record, &mut accept) {
+                    Ok(payload) => {
+                        boot.running = payload.slot;
+                        boot.payload = Some(payload);
+                        boot.trial = slots.trial;
+                        continue;
+                    }
+                    Err(refusal) => refusal,
+                },
+                Err(refusal) => refusal,
+            };
+            let [a, b] = &mut boot.refused;
+            *match side {
+                Side::A => a,
+                Side::B => b,
+            } = Some(refusal);
         }
         Ok((slots, boot))
     }
 
     /// Reads what is before the payload, and decides for good what a cut may have left undecided.
+    #[inline(never)]
     fn settled(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
         let record = self.record(side)?;
         let state = record.state();
@@ -673,6 +712,7 @@ impl<F: NorFlash> Slots<F> {
     }
 
     /// Checks a slot, marks its trial, and asks the caller.
+    #[inline(never)]
     fn try_run(
         &mut self,
         side: Side,
@@ -722,6 +762,7 @@ impl<F: NorFlash> Slots<F> {
     }
 
     /// The update that is under way.
+    #[inline(never)]
     pub fn update(&self) -> Option<Release> {
         self.update.as_ref().map(|update| update.header.release())
     }
@@ -787,21 +828,22 @@ impl<F: NorFlash> Slots<F> {
     pub fn begin(&mut self, release: &Release) -> Result<(), BeginError> {
         self.check(release)?;
         let Release { length, sha256, sequence, robot } = *release;
-        // Slots that cannot be read are empty.
-        let [a, b] = Side::BOTH.map(|side| self.record(side).ok());
-        let side = self.running.map_or_else(
-            || {
-                let rank = |record: &Option<Record>| {
-                    record.filter(|record| record.state() == State::Confirmed).map(|r| r.rank())
-                };
-                if rank(&a) <= rank(&b) { Side::A } else { Side::B }
-            },
-            |running| running.side.other(),
-        );
-        let generations = [a, b].into_iter().flatten().map(|record| record.header.generation);
         // That of what runs, even if it cannot be read just now.
-        let known = self.running.map_or(0, |running| running.header.generation);
-        let generation = generations.max().unwrap_or(0).max(known).saturating_add(1);
+        let mut newest = self.running.map_or(0, |running| running.header.generation);
+        let mut ranks = [None; 2];
+        for (rank, side) in ranks.iter_mut().zip(Side::BOTH) {
+            // A slot that cannot be read is empty.
+            let Ok(record) = self.record(side) else { continue };
+            newest = newest.max(record.header.generation);
+            *rank = (record.state() == State::Confirmed).then(|| record.rank());
+        }
+        let generation = newest.saturating_add(1);
+        let [a, b] = ranks;
+        let side = match self.running {
+            Some(running) => running.side.other(),
+            None if a <= b => Side::A,
+            None => Side::B,
+        };
         self.update = Some(Update {
             side,
             header: Header { length, sequence, generation, robot, sha256 },
@@ -991,6 +1033,7 @@ impl<F: NorFlash> Slots<F> {
         slot.saturating_add(offset)
     }
 
+    #[inline(never)]
     fn record(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
         let mut bytes = [0; HEADER];
         self.flash.read(self.at(side, 0), &mut bytes).map_err(Refusal::Flash)?;
@@ -1057,11 +1100,11 @@ impl<F: NorFlash> Slots<F> {
             let whole = length.checked_next_multiple_of(CELL).unwrap_or(BUFFER).min(BUFFER);
             let part = buffer.get_mut(..whole).unwrap_or(&mut []);
             self.flash.read(at, part)?;
-            digest.update(part.get(..length).unwrap_or(&[]));
+            feed(&mut digest, part.get(..length).unwrap_or(&[]));
             left = left.saturating_sub(length);
             at = at.saturating_add(u32::try_from(whole).unwrap_or(u32::MAX));
         }
-        Ok(digest.finalize().into())
+        Ok(finish(digest))
     }
 }
 

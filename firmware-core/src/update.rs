@@ -159,6 +159,7 @@ use crate::capacity::{
 };
 use crate::control_loop::{Alarms, Mode};
 use crate::cost;
+use crate::encoding::{ReadError, Reader, Writer};
 use crate::model::Model;
 use crate::slots::{
     BeginError, Boot, Geometry, GeometryError, MarkError, Payload, Release, Slots, VerifyError,
@@ -175,6 +176,9 @@ pub const SILENCE_US: u64 = 5_000_000;
 pub const SIGNATURE_PAUSE_US: u64 = 1_000_000;
 /// Bytes of a signature.
 pub const SIGNATURE: usize = 64;
+
+/// Bytes of a name.
+const NAME: usize = 24;
 
 /// A signature; empty where nothing is signed.
 pub type Signature = Vec<u8, SIGNATURE>;
@@ -239,6 +243,40 @@ pub enum Ask {
     },
 }
 
+impl Request {
+    /// As postcard has it, over the one that is there.
+    #[inline(never)]
+    pub(crate) fn read(&mut self, reader: &mut Reader<'_>) -> Result<(), ReadError> {
+        self.number = reader.byte()?;
+        let kind = reader.word()?;
+        if kind > 6 {
+            return Err(ReadError::Unsupported);
+        }
+        // All but Hello and Confirm are of a session.
+        let session = if kind == 0 || kind == 5 { 0 } else { reader.word()? };
+        self.ask = match kind {
+            0 => Ask::Hello,
+            1 => {
+                let release = Release::read(reader)?;
+                Ask::Begin { session, release, signature: Signature::new() }
+            }
+            2 => Ask::Chunk { session, offset: reader.word()?, bytes: Vec::new() },
+            3 => Ask::Verify { session },
+            4 => Ask::Activate { session, signature: Signature::new() },
+            5 => Ask::Confirm { signature: Signature::new() },
+            _ => Ask::Abort { session, signature: Signature::new() },
+        };
+        match &mut self.ask {
+            Ask::Hello | Ask::Verify { .. } => Ok(()),
+            Ask::Chunk { bytes, .. } => reader.list(bytes, Reader::byte),
+            Ask::Begin { signature, .. }
+            | Ask::Activate { signature, .. }
+            | Ask::Confirm { signature }
+            | Ask::Abort { signature, .. } => reader.list(signature, Reader::byte),
+        }
+    }
+}
+
 /// What the controller answers.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Answer {
@@ -246,6 +284,33 @@ pub struct Answer {
     pub number: u8,
     /// What.
     pub say: Say,
+}
+
+impl Answer {
+    /// As postcard writes it.
+    #[inline(never)]
+    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
+        to.byte(self.number);
+        let (kind, number) = match &self.say {
+            Say::Hello(hello) => {
+                to.byte(0);
+                return hello.write(to);
+            }
+            Say::Working { most_ms } => (1, Some(*most_ms)),
+            Say::Begun { written } => (2, Some(*written)),
+            Say::Written { written } => (3, Some(*written)),
+            Say::Verified => (4, None),
+            Say::Activated => (5, None),
+            Say::Confirmed => (6, None),
+            Say::Aborted => (7, None),
+            Say::Refused(refused) => {
+                to.byte(8);
+                return refused.write(to);
+            }
+        };
+        to.byte(kind);
+        number.into_iter().for_each(|number| to.word(number));
+    }
 }
 
 /// The kinds of answers.
@@ -358,15 +423,52 @@ pub enum Refused {
     Flash,
 }
 
+impl Refused {
+    #[inline(never)]
+    fn write<const C: usize>(self, to: &mut Writer<C>) {
+        let (kind, number) = match self {
+            Self::Unknown { variant } => {
+                to.byte(0);
+                return to.byte(variant);
+            }
+            Self::TooLong { most } => (1, Some(most)),
+            Self::Busy => (2, None),
+            Self::Working => (3, None),
+            Self::Signature => (4, None),
+            Self::Pause { ms } => (5, Some(ms)),
+            Self::AnotherRobot { robot } => (6, Some(robot)),
+            Self::BelowFloor { floor } => (7, Some(floor)),
+            Self::Length { room } => (8, Some(room)),
+            Self::OnTrial => (9, None),
+            Self::InUse => (10, None),
+            Self::NoSession => (11, None),
+            Self::OutOfOrder { written } => (12, Some(written)),
+            Self::Incomplete { written } => (13, Some(written)),
+            Self::Hash => (14, None),
+            Self::Model => (15, None),
+            Self::NotVerified => (16, None),
+            Self::NotOnTrial => (17, None),
+            Self::TooEarly { good, needed } => {
+                to.byte(18);
+                to.word(good);
+                return to.word(needed);
+            }
+            Self::Flash => (19, None),
+        };
+        to.byte(kind);
+        number.into_iter().for_each(|number| to.word(number));
+    }
+}
+
 /// Who a controller is.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Hello {
     /// [`PROTOCOL`].
     pub protocol: u8,
     /// Its firmware and version.
-    pub firmware: String<24>,
+    pub firmware: String<NAME>,
     /// Beginning of the robot's name, as far as there is room.
-    pub name: String<24>,
+    pub name: String<NAME>,
     /// [`robot`] of the whole name.
     pub robot: u32,
     /// What the loop is doing.
@@ -383,6 +485,37 @@ pub struct Hello {
     pub floor: u32,
     /// The first bytes of the public key that is trusted; `None`: everybody is.
     pub key: Option<[u8; 8]>,
+}
+
+impl Hello {
+    fn write<const C: usize>(&self, to: &mut Writer<C>) {
+        to.byte(self.protocol);
+        to.bytes(self.firmware.as_bytes());
+        to.bytes(self.name.as_bytes());
+        to.word(self.robot);
+        to.byte(self.mode as u8);
+        let Capacities { sample_us, states, inputs, room, instructions, lag, .. } = self.capacities;
+        let Capacities { observables, blocks, factors, terms, sparse_terms, .. } = self.capacities;
+        to.word(sample_us);
+        to.byte(states);
+        to.byte(inputs);
+        to.word(room);
+        to.word(instructions);
+        to.byte(lag);
+        for capacity in [observables, blocks, factors, terms, sparse_terms] {
+            to.word(capacity.into());
+        }
+        to.byte(self.which as u8);
+        self.release.write(to);
+        to.byte(self.trial.is_some().into());
+        if let Some(Trial { good, needed }) = self.trial {
+            to.word(good);
+            to.word(needed);
+        }
+        to.word(self.floor);
+        to.byte(self.key.is_some().into());
+        self.key.iter().for_each(|key| to.array(key));
+    }
 }
 
 /// How a trial goes.
@@ -540,19 +673,14 @@ impl Purpose {
 /// ```
 pub fn statement(purpose: Purpose, release: &Release) -> [u8; 64] {
     let Release { length, sha256, sequence, robot } = release;
-    let mut bytes = [0; 64];
-    let fields: [&[u8]; 6] = [
-        b"koopman-release\0",
-        &[purpose as u8, 0, 0, 0],
-        &robot.to_le_bytes(),
-        &sequence.to_le_bytes(),
-        &length.to_le_bytes(),
-        sha256,
-    ];
-    for (place, byte) in bytes.iter_mut().zip(fields.into_iter().flatten()) {
-        *place = *byte;
+    let mut statement = Writer::<64>::new();
+    statement.array(b"koopman-release\0");
+    statement.array(&[purpose as u8, 0, 0, 0]);
+    for number in [robot, sequence, length] {
+        statement.array(&number.to_le_bytes());
     }
-    bytes
+    statement.array(sha256);
+    statement.all()
 }
 
 /// Whose releases are installed.
@@ -573,6 +701,7 @@ impl Trust for PublicKey {
         self.0.first_chunk().copied()
     }
 
+    #[inline(never)]
     fn accepts(&self, statement: &[u8; 64], signature: &[u8]) -> bool {
         let Ok(signature) = <[u8; SIGNATURE]>::try_from(signature) else { return false };
         let signature = ed25519_compact::Signature::new(signature);
@@ -624,7 +753,7 @@ pub struct Identity<'r> {
 /// Takes requests, as a [`Port`](crate::link::Port) hands them on.
 pub trait Updates {
     /// A request has arrived; what can be answered at once.
-    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer>;
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer>;
 
     /// Whether there is something to do that takes long: only while the robot is at rest.
     fn is_working(&self) -> bool;
@@ -643,7 +772,7 @@ pub trait Updates {
 pub struct NoUpdates;
 
 impl Updates for NoUpdates {
-    fn receive(&mut self, request: &Request, _: Mode, _: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, _: Mode, _: u64) -> Option<Answer> {
         let unknown = Refused::Unknown { variant: crate::link::REQUEST };
         Some(Answer { number: request.number, say: Say::Refused(unknown) })
     }
@@ -662,7 +791,7 @@ impl Updates for NoUpdates {
 }
 
 impl<U: Updates> Updates for Option<U> {
-    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
         match self {
             Some(updates) => updates.receive(request, mode, now_us),
             None => NoUpdates.receive(request, mode, now_us),
@@ -733,6 +862,7 @@ where
     ///
     /// # Errors
     /// [`GeometryError`].
+    #[inline(always)]
     pub fn boot(
         flash: F,
         geometry: Geometry,
@@ -807,6 +937,7 @@ where
     }
 
     /// Whether a session is alive; that of an update that is over is not.
+    #[inline(never)]
     fn settle(&mut self, now_us: u64) {
         if let Some(session) = &mut self.session {
             let heard_us = *session.heard_us.get_or_insert(now_us);
@@ -1034,11 +1165,13 @@ where
     T: Trust,
     A: FnMut(Payload) -> bool,
 {
-    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    #[inline(never)]
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
         self.settle(now_us);
-        let Request { number, ask } = request;
-        let answer = |say| Some(Answer { number: *number, say });
-        if *ask == Ask::Hello {
+        let Request { number, ask } = &request;
+        let number = *number;
+        let answer = |say| Some(Answer { number, say });
+        if matches!(ask, Ask::Hello) {
             return answer(Say::Hello(self.hello(mode)));
         }
         if mode == Mode::Running {
@@ -1046,15 +1179,15 @@ where
         }
         match &self.job {
             // It is on its way.
-            Some(Job::Ask(Request { number: known, .. })) if known == number => return None,
-            Some(Job::Erase(known)) if known == number => return answer(self.working()),
+            Some(Job::Ask(Request { number: known, .. })) if *known == number => return None,
+            Some(Job::Erase(known)) if *known == number => return answer(self.working()),
             Some(_) => return answer(Say::Refused(Refused::Working)),
             None => {}
         }
         match self.at_once(ask, now_us) {
             Ok(Some(say)) => answer(say),
             Ok(None) => {
-                self.job = Some(Job::Ask(request.clone()));
+                self.job = Some(Job::Ask(request));
                 None
             }
             Err(refused) => answer(Say::Refused(refused)),
@@ -1065,6 +1198,7 @@ where
         self.job.is_some()
     }
 
+    #[inline(never)]
     fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer> {
         self.settle(now_us);
         let (number, result) = match self.job.take()? {
@@ -1086,7 +1220,7 @@ where
                 }
             },
         };
-        if result == Err(Refused::Flash) {
+        if matches!(result, Err(Refused::Flash)) {
             self.session = None;
         }
         if let Some(session) = &mut self.session {
@@ -1107,12 +1241,14 @@ where
 }
 
 /// As much of a text as there is room for.
-fn beginning<const C: usize>(text: &str) -> String<C> {
-    let mut beginning = String::new();
-    for character in text.chars() {
-        if beginning.push(character).is_err() {
-            break;
-        }
+#[inline(never)]
+fn beginning(text: &str) -> String<NAME> {
+    let mut end = text.len().min(NAME);
+    while !text.is_char_boundary(end) {
+        end = end.saturating_sub(1);
     }
+    let mut beginning = String::new();
+    // There is room.
+    let _ = beginning.push_str(text.get(..end).unwrap_or(""));
     beginning
 }

@@ -8,7 +8,7 @@ use bytes::{
     assemble, bytes_of, error, error_after, error_with, numbers_of, seal, sections, set_number,
     u32_at,
 };
-use firmware_core::blob::{self, EmitError, ParseError};
+use firmware_core::blob::{self, EmitError, ParseError, parse_into};
 use firmware_core::capacity::{
     MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_OUTPUTS, MAX_STATES,
     MAX_TERMS,
@@ -801,11 +801,57 @@ fn metadata() -> impl Strategy<Value = Vec<u8>> {
 
 fn accept(bytes: &[u8], seed: u64) {
     let slot = Slot::new(bytes);
-    if let Ok(model) = parse(slot.bytes()) {
-        exercise(&model, seed);
+    let parsed = parse(slot.bytes());
+    if let Ok(model) = &parsed {
+        exercise(model, seed);
     }
     let _ = parse_prefix(slot.bytes());
     let _ = blob::self_test(slot.bytes());
+    // Where another model was, and with a state that has seen something of it.
+    let golden = Slot::new(&GOLDEN);
+    let (mut model, mut state) = (parse(golden.bytes()).unwrap(), PredictorState::new());
+    let n = model.structure().states().len();
+    Predictor::new(&model).observe(&mut state, &[], &vec![0.5; n]).unwrap();
+    let loaded = parse_into(slot.bytes(), &mut model, &mut state);
+    assert_eq!(loaded.err(), parsed.as_ref().err().copied());
+    assert_eq!(state, PredictorState::new());
+    as_serde_reads(slot.bytes(), &parsed);
+    assert_eq!(model, parsed.unwrap_or(Model::empty()));
+}
+
+/// Metadata, once it is their turn, are what serde makes of them, or refused for the reason that it has.
+fn as_serde_reads(blob: &[u8], parsed: &Result<Model<'_>, ParseError>) {
+    use ParseError::*;
+    let earlier = matches!(
+        parsed,
+        Err(Misaligned
+            | Truncated { .. }
+            | Trailing { .. }
+            | Magic
+            | Version { .. }
+            | Checksum { .. }
+            | SectionTable
+            | UnknownSection { .. }
+            | MissingSection { kind: METADATA })
+    );
+    if earlier {
+        return;
+    }
+    let sections = sections(blob);
+    let (_, _, metadata) = sections.iter().find(|section| section.0 == METADATA).unwrap();
+    match postcard::take_from_bytes::<ModelRepr<'_>>(metadata) {
+        Ok((repr, [])) => match Structure::try_from(repr) {
+            Ok(structure) => match parsed {
+                Ok(model) => assert_eq!(*model.structure(), structure),
+                Err(error) => assert!(!matches!(error, Metadata | Unsupported), "{error:?}"),
+            },
+            Err(error) => assert_eq!(parsed.as_ref().err(), Some(&Model(error))),
+        },
+        Err(postcard::Error::SerdeDeCustom) => {
+            assert_eq!(parsed.as_ref().err(), Some(&Unsupported))
+        }
+        _ => assert_eq!(parsed.as_ref().err(), Some(&Metadata)),
+    }
 }
 
 proptest! {
@@ -875,6 +921,30 @@ proptest! {
         if let Some(blob) = around(&metadata, terms, seed) {
             accept(&blob, seed);
         }
+    }
+
+    /// Metadata with bytes that are another, that are too many, or missing; lengths and variants of more
+    /// than a byte among them.
+    #[test]
+    fn damaged_metadata(
+        which in 0..fixtures::all().len(),
+        changes in prop::collection::vec(
+            (any::<prop::sample::Index>(), 0_usize..3, prop::sample::select(
+                vec![vec![], vec![0], vec![1], vec![5], vec![0x80], vec![0x80, 0], vec![0x81, 1],
+                    vec![0xFF; 4], vec![0xFF, 0xFF, 0xFF, 0xFF, 0x0F], vec![0x80, 0x80, 0x80, 0x80, 0x10],
+                    [vec![0xFF; 9], vec![1]].concat(), [vec![0x80; 9], vec![2]].concat()],
+            )),
+            1..4,
+        ),
+    ) {
+        let mut sections = sections(&fixtures::emit(&fixtures::all()[which]));
+        for (at, removed, inserted) in changes {
+            let metadata = &mut sections[0].2;
+            let at = at.index(metadata.len());
+            let end = (at + removed).min(metadata.len());
+            metadata.splice(at..end, inserted);
+        }
+        accept(&assemble(&sections), 1);
     }
 
     /// Error bounds with a few bytes overwritten or missing, on every kind of model.

@@ -7,6 +7,7 @@ use firmware_core::dictionary::{DictionaryError, Source};
 use firmware_core::model::{
     Model, ModelError, ModelRepr, Space, State, Structure, Symmetry, Target,
 };
+use firmware_core::{PredictError, Predictor, PredictorState};
 use fixtures::{at, hermite, input, repr, scaled, state};
 
 fn refused(repr: ModelRepr<'static>) -> ModelError {
@@ -163,4 +164,23 @@ fn an_absolute_angle_has_two_outputs() {
     assert_eq!(fixtures::structure(&full).outputs(), MAX_OUTPUTS);
     assert_eq!(fixtures::structure(&fixtures::translation()).outputs(), 4);
     assert_eq!(fixtures::structure(&fixtures::lagged()).outputs(), 2);
+}
+
+#[test]
+fn an_empty_model_predicts_nothing() {
+    let model = Model::<f32>::empty();
+    assert_eq!((model.structure().outputs(), model.coefficients_per_output()), (0, 0));
+    let predictor = Predictor::new(&model);
+    let mut state = PredictorState::new();
+    predictor.observe(&mut state, &[], &[]).unwrap();
+    assert_eq!(predictor.step(&mut state, &[]), Ok(()));
+    assert_eq!(predictor.coordinates(&state, &mut []), Ok(()));
+    let mut untouched = [1.0; 3];
+    predictor.rollout_held(&mut state, &[], &mut untouched).unwrap();
+    assert_eq!(untouched, [1.0; 3]);
+    let found = 1;
+    let mismatch = PredictError::DimensionMismatch { field: "coordinates", expected: 0, found };
+    assert_eq!(predictor.observe(&mut state, &[], &[0.0]), Err(mismatch));
+    state.clear();
+    assert_eq!(state, PredictorState::new());
 }

@@ -117,13 +117,38 @@ fn arc_tangents() {
 }
 
 #[test]
-fn reciprocal_roots() {
+fn back_on_the_circle() {
     let mut worst = 0.0_f64;
-    // What the predictor takes it of: between 1e-6 and 1e6.
-    for i in 0..1 << 20 {
-        let x = 10.0_f64.powf(f64::from(i) * 12.0 / f64::from(1 << 20) - 6.0) as f32;
-        worst = worst.max((f64::from(x.reciprocal_root()) * f64::from(x).sqrt() - 1.0).abs());
+    // As long and as short as is accepted: between 1e-3 and 1e3.
+    for i in 1..1 << 20 {
+        let length = 10.0_f64.powf(f64::from(i) * 6.0 / f64::from(1 << 20) - 3.0);
+        let (sin, cos) = f64::from(i).sin_cos();
+        let mut pair = [(length * sin) as f32, (length * cos) as f32];
+        assert!(f32::on_circle(&mut pair), "{length}");
+        let [s, c] = pair.map(f64::from);
+        worst = worst.max((s.hypot(c) - 1.0).abs()).max((s - sin).abs()).max((c - cos).abs());
     }
     println!("at most {worst:.3e}");
-    assert!(worst <= 2.4e-7);
+    assert!(worst <= 1.8e-7);
+    for lost in [[0.0, 0.0], [1024.0, 1.0], [6e-4, 6e-4], [f32::NAN, 0.0], [0.0, f32::INFINITY]] {
+        let mut pair = lost;
+        assert!(!f32::on_circle(&mut pair), "{lost:?}");
+        assert_eq!(pair.map(f32::to_bits), lost.map(f32::to_bits));
+    }
+}
+
+#[test]
+fn remainders_are_those_of_libm() {
+    use std::f32::consts::TAU;
+    // Numbers of every size and sign, zeros, infinities and NaN among them.
+    let all = || (0..=u32::MAX).step_by(104_729).map(f32::from_bits);
+    let mut divisors = vec![TAU, 1.0, f32::MIN_POSITIVE, f32::MAX, f32::INFINITY, 1e-42, 0.0, -3.0];
+    divisors.extend(all().step_by(1_777));
+    for divisor in divisors {
+        for x in all().chain([TAU, -TAU, 2.0 * TAU, 0.0, -0.0, f32::INFINITY, f32::NAN]) {
+            let (found, expected) = (Scalar::rem(x, divisor), libm::fmodf(x, divisor));
+            let same = found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan();
+            assert!(same, "{x:e} and {divisor:e}: {found:e} instead of {expected:e}");
+        }
+    }
 }

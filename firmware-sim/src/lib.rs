@@ -15,6 +15,7 @@
 //! | [`soft_leg`] | soft pneumatic leg, an invented but plausible plant |
 //! | [`bench`](mod@bench) | ROSbot and soft leg, wired to a simulated microcontroller |
 //! | [`mcu`] | the simulated microcontroller: clock, peripherals, flash, misuse |
+//! | [`plant_line`] | what a controller and a simulated robot tell each other when they are apart |
 //! | [`fault`], [`faulty`] | what goes wrong and when; devices that show it |
 //! | [`run`] | the firmware on a simulated controller: scenarios, verdicts, plots |
 //! | [`record`] | logs as CSV, one file per trajectory |
@@ -45,6 +46,8 @@
 //! # Ok::<(), firmware_sim::drive::DriveError>(())
 //! ```
 
+#![forbid(unsafe_code)]
+
 pub mod arm;
 pub mod bench;
 pub mod drive;
@@ -57,6 +60,7 @@ pub mod mcu;
 mod normal;
 pub mod paper;
 pub mod plant;
+pub mod plant_line;
 pub mod record;
 pub mod rosbot;
 pub mod run;

@@ -1,13 +1,14 @@
 //! The command `firmware-sim`.
 
 use clap::{Args, Parser, Subcommand};
-use firmware_core::model::Structure;
 use firmware_core::update::PublicKey;
 use firmware_sim::Integrator;
 use firmware_sim::fault::Fault;
 use firmware_sim::paper::PaperLogs;
+use firmware_sim::plant_line;
 use firmware_sim::record::{Recording, Robot, Settings};
 use firmware_sim::run;
+use firmware_sim::run::apart::{self, Line, Plant};
 use firmware_sim::run::figure::Figure;
 use firmware_sim::run::live::Live;
 use firmware_sim::run::log::Logger;
@@ -59,6 +60,82 @@ enum Command {
     Run(RunArgs),
     Sweep(SweepArgs),
     Serve(ServeArgs),
+    Plant(PlantArgs),
+}
+
+/// Simulates a robot for a controller that runs somewhere else: in QEMU, as firmware-sim/cortex-m/robot starts
+/// it, or on a board.
+///
+/// Sensor readings and outputs go over a line of their own, --port, as the documentation of
+/// firmware_sim::plant_line says: one frame each way per tick of the controller, which keeps the time. Ends
+/// when the controller hangs up.
+///
+/// With --link the controller's link is passed on to clients, as `serve` does it: its first line then says
+/// where they come in. Only so it can be driven while a client listens, with --drive.
+///
+/// A line is tcp:HOST:PORT, unix:PATH, or a serial device.
+#[derive(Args)]
+#[command(verbatim_doc_comment)]
+struct PlantArgs {
+    /// Which robot
+    robot: PlantRobot,
+    /// The line to the controller's sensors and actuators
+    #[arg(long, value_name = "LINE")]
+    port: String,
+    /// The controller's link, for --tcp, --pty and --drive
+    #[arg(long, value_name = "LINE")]
+    link: Option<String>,
+    /// Baud rate of serial devices
+    #[arg(long, value_name = "BAUD", default_value_t = 576_000)]
+    baud: u32,
+    #[command(flatten)]
+    door: DoorArgs,
+    /// Drive at random, or by the scenario
+    #[arg(long, requires = "link")]
+    drive: bool,
+    /// Scenario, a TOML file: faults and, with --drive, the script
+    #[arg(long, value_name = "FILE")]
+    scenario: Option<PathBuf>,
+    /// Faults of the robot and its sensors, as for run
+    #[arg(long, value_name = "FAULT", value_delimiter = ',')]
+    faults: Vec<Fault>,
+    /// Seed of sensors, faults and random commands
+    #[arg(long, value_name = "K", default_value_t = 1)]
+    seed: u64,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum PlantRobot {
+    /// The skid-steered ROSbot
+    Rosbot,
+    /// The soft leg
+    SoftLeg,
+}
+
+/// Where clients come in.
+#[derive(Args)]
+struct DoorArgs {
+    /// Listen on this address; port 0 is a free one [default: 127.0.0.1:0]
+    #[arg(long, value_name = "ADDRESS")]
+    tcp: Option<std::net::SocketAddr>,
+    /// A new pseudo-terminal instead
+    #[arg(long, conflicts_with = "tcp")]
+    pty: bool,
+}
+
+impl DoorArgs {
+    fn open(&self) -> Result<Door, String> {
+        match self.pty {
+            #[cfg(unix)]
+            true => Door::pty().map_err(|e| format!("there is no pseudo-terminal: {e}")),
+            #[cfg(not(unix))]
+            true => Err("there are no pseudo-terminals here; use --tcp".into()),
+            false => {
+                let address = self.tcp.unwrap_or_else(|| ([127, 0, 0, 1], 0).into());
+                Door::tcp(address).map_err(|e| format!("cannot listen on {address}: {e}"))
+            }
+        }
+    }
 }
 
 /// Runs a model's robot in real time, with its serial line on a TCP port or a pseudo-terminal: a controller
@@ -72,12 +149,8 @@ enum Command {
 struct ServeArgs {
     /// The blob
     model: PathBuf,
-    /// Listen on this address; port 0 is a free one [default: 127.0.0.1:0]
-    #[arg(long, value_name = "ADDRESS")]
-    tcp: Option<std::net::SocketAddr>,
-    /// A new pseudo-terminal instead
-    #[arg(long, conflicts_with = "tcp")]
-    pty: bool,
+    #[command(flatten)]
+    door: DoorArgs,
     /// Install only models that were signed with this key, as `trainer keygen` writes it to NAME.pub
     /// [default: everybody's]
     #[arg(long, value_name = "FILE")]
@@ -261,7 +334,8 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
     let blob = run::Blob::read(&args.model)?;
     let model = blob.model().map_err(|e| named(&e))?;
     let structure = model.structure();
-    let scenario = scenario((args.scenario.as_deref(), args.seconds, &args.faults), structure)?;
+    let robot = run::Robot::of(structure)?;
+    let scenario = scenario((args.scenario.as_deref(), args.seconds, &args.faults), robot)?;
     // Not only after a run of a minute.
     if let Some(path) = args.plot.as_ref().filter(|path| !run::folder_of(path).is_dir()) {
         return Err(
@@ -281,7 +355,7 @@ fn run_model(args: &RunArgs) -> Result<(), Box<dyn Error>> {
         name => format!("{}: {name}", structure.robot()),
     };
     let faults = scenario.faults.iter().map(|fault| fault.0).collect();
-    let horizon = run::Robot::of(structure).map_or(10, run::Robot::ahead);
+    let horizon = robot.ahead();
     let mut figure = args.plot.as_ref().map(|_| Figure::new(title, &model, horizon, faults));
     let mut live = args.live.then(|| (Live::new(), std::time::Instant::now()));
     if args.live {
@@ -359,7 +433,8 @@ fn serve_model(args: &ServeArgs) -> Result<(), Box<dyn Error>> {
     let model = blob.model().map_err(|e| named(&e))?;
     let structure = model.structure();
     let seconds = Some(args.seconds.unwrap_or(NO_END_S));
-    let scenario = scenario((args.scenario.as_deref(), seconds, &args.faults), structure)?;
+    let of = run::Robot::of(structure)?;
+    let scenario = scenario((args.scenario.as_deref(), seconds, &args.faults), of)?;
     let key = args.public_key.as_deref().map(public_key).transpose()?;
     let mut store = Store::new(&blob, key);
     if let Some(file) = &args.flash {
@@ -370,16 +445,7 @@ fn serve_model(args: &ServeArgs) -> Result<(), Box<dyn Error>> {
         // Nobody may be reading.
         let _ = writeln!(std::io::stderr(), "{:.2} s: {robot} {boot}", boot.at_us as f64 * 1e-6);
     });
-    let door = match args.pty {
-        #[cfg(unix)]
-        true => Door::pty().map_err(|e| format!("there is no pseudo-terminal: {e}"))?,
-        #[cfg(not(unix))]
-        true => return Err("there are no pseudo-terminals here; use --tcp".into()),
-        false => {
-            let address = args.tcp.unwrap_or_else(|| ([127, 0, 0, 1], 0).into());
-            Door::tcp(address).map_err(|e| format!("cannot listen on {address}: {e}"))?
-        }
-    };
+    let door = args.door.open()?;
     let mut out = std::io::stdout();
     writeln!(out, "{} on {}", structure.robot(), door.name()?)?;
     out.flush()?;
@@ -395,6 +461,36 @@ fn serve_model(args: &ServeArgs) -> Result<(), Box<dyn Error>> {
     let summary = summary.map_err(|e| named(&e))?;
     write!(out, "{}", summary.text())?;
     Ok(())
+}
+
+fn plant(args: &PlantArgs) -> Result<(), Box<dyn Error>> {
+    let (robot, called) = match args.robot {
+        PlantRobot::Rosbot => (plant_line::Robot::Rosbot, "rosbot"),
+        PlantRobot::SoftLeg => (plant_line::Robot::SoftLeg, "soft-leg"),
+    };
+    let scenario = scenario((args.scenario.as_deref(), Some(NO_END_S), &args.faults), robot.run())?;
+    let faults: Vec<Fault> = scenario.faults.iter().map(|fault| fault.0).collect();
+    let mut plant = Plant::new(robot, &faults, args.seed)?;
+    let open = |name: &str| {
+        Line::open(name, args.baud).map_err(|e| format!("{name}: cannot be opened: {e}"))
+    };
+    let mut line = open(&args.port)?;
+    if let Some(link) = &args.link {
+        let door = args.door.open()?;
+        let mut out = std::io::stdout();
+        writeln!(out, "{called} on {}", door.name()?)?;
+        out.flush()?;
+        let (name, link, seed, drives) = (link.clone(), open(link)?, args.seed, args.drive);
+        std::thread::spawn(move || {
+            let Err(error) = apart::pass_on(link, robot, (&scenario, seed), door, drives);
+            let _ = writeln!(std::io::stderr(), "{name}: {error}");
+        });
+    }
+    let Err(error) = plant.serve(&mut line, &mut |what| {
+        // Nobody may be reading.
+        let _ = writeln!(std::io::stderr(), "{what}");
+    });
+    Err(format!("{}: {error}", args.port).into())
 }
 
 /// The key in a file: 64 hexadecimal digits.
@@ -416,18 +512,17 @@ fn public_key(path: &Path) -> Result<PublicKey, String> {
 
 fn scenario(
     (path, seconds, faults): (Option<&Path>, Option<f64>, &[Fault]),
-    structure: &Structure<'_>,
+    robot: run::Robot,
 ) -> Result<Scenario, Box<dyn Error>> {
-    let robot = run::Robot::of(structure)?;
     let mut scenario = match path {
-        Some(path) => Scenario::load(path, structure.inputs().len())?,
+        Some(path) => Scenario::load(path, run::Robot::INPUTS)?,
         None => Scenario::random(robot.limit()),
     };
     if let Some(seconds) = seconds {
         scenario.seconds = seconds;
     }
     scenario.faults.extend(faults.iter().copied().map(FaultText));
-    scenario.check(structure.inputs().len())?;
+    scenario.check(run::Robot::INPUTS)?;
     Ok(scenario)
 }
 
@@ -447,6 +542,7 @@ fn run(arguments: Arguments) -> Result<(), Box<dyn Error>> {
         Command::Run(args) => run_model(&args)?,
         Command::Sweep(args) => sweep_model(&args)?,
         Command::Serve(args) => serve_model(&args)?,
+        Command::Plant(args) => plant(&args)?,
         Command::Record { set: Some(LogSet::Paper { seed, out, overwrite }), .. } => {
             let logs = PaperLogs::new(seed);
             logs.write(&out, overwrite)?;

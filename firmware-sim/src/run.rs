@@ -18,8 +18,10 @@
 //! | [`figure`], [`live`] | predicted beside measured: a plot, and a view in the terminal |
 //! | [`store`] | the models in its flash, and who may install others |
 //! | [`serve`] | the same in real time, for a client on a port |
+//! | [`apart`] | the robot alone, for a controller in QEMU or on a board |
 //! | [`sweep`] | every fault on every robot, against what is expected |
 
+pub mod apart;
 pub mod figure;
 pub mod host;
 pub mod live;
@@ -79,6 +81,9 @@ pub enum Robot {
 }
 
 impl Robot {
+    /// Inputs of each of them.
+    pub const INPUTS: usize = 2;
+
     /// The robot that a model is of, by its states and inputs.
     ///
     /// # Errors

@@ -105,6 +105,11 @@ fn mistakes_get_one_line_and_leave_nothing_behind() {
         ),
         (&["run", SOFT_LEG, "--faults", "leak:2@1..2=1"], "or no such unit"),
         (&["sweep", "none.bin"], "none.bin: cannot be read"),
+        (&["plant", "rosbot", "--port", "unix:none"], "unix:none: cannot be opened"),
+        (
+            &["plant", "soft-leg", "--port", "unix:none", "--faults", "late-tick@1..2=1"],
+            "a SoftLeg without its controller has no such fault",
+        ),
     ] {
         let said = refuse(folder, arguments);
         assert!(said.contains(fragment), "{arguments:?}: {said}");

@@ -63,7 +63,9 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
         symmetry =
             Symmetry::Translation { coordinates: coordinates.fold(0, |set, i| set | 1 << i) };
     }
-    let largest = random.below(6) as u8;
+    // Half of the dense models look at the present sample alone.
+    let now = dense && random.chance(50);
+    let largest = if now { 0 } else { random.below(6) as u8 };
     let mut sources = Vec::new();
     for (i, state) in states.iter().enumerate() {
         let i = i as u8;
@@ -88,7 +90,7 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
             }
         }
     }
-    for i in (1..sources.len()).rev() {
+    for i in (1..sources.len()).rev().filter(|_| !now) {
         sources.swap(i, random.below(i + 1));
     }
     let most = if dense { 5 } else { 16 };
@@ -97,7 +99,7 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
     let (mut observables, mut factors) = (Vec::new(), Vec::new());
     for group in &sources {
         let observable = observables.len() as u8;
-        let fourier = group.len() == 2 && random.chance(70);
+        let fourier = group.len() == 2 && random.chance(if now { 10 } else { 70 });
         let basis = if fourier { Basis::Fourier } else { Basis::Hermite };
         let order =
             if random.chance(70) { 1 } else { 2 + random.below(if dense { 1 } else { 3 }) as u8 };
@@ -116,7 +118,7 @@ fn model(random: &mut Random, dense: bool) -> Option<Vec<u8>> {
     let blocks = match dense {
         false => factors.iter().map(|_| block).collect(),
         true => {
-            let first = 1 + random.below(factors.len());
+            let first = if now { factors.len() } else { 1 + random.below(factors.len()) };
             let mut blocks = vec![Block { factors: first as u8, max_degree: 0 }];
             blocks.extend((first..factors.len()).map(|_| block));
             blocks.into_iter().collect()

@@ -8,6 +8,8 @@ use firmware_sim::run::Blob;
 
 #[path = "../../firmware-sim/cortex-m/src/bits.rs"]
 mod bits;
+#[path = "../../firmware-sim/cortex-m/src/shapes.rs"]
+mod shapes;
 
 fn main() -> ExitCode {
     let steps = std::env::args().nth(1).and_then(|steps| steps.parse().ok());
@@ -21,6 +23,16 @@ fn main() -> ExitCode {
         let model = blob.model().expect("a blob");
         match bits::bits(&model, steps) {
             Some((predicted, hash)) => println!("{robot} {predicted} of {steps} {hash:016x}"),
+            None => return ExitCode::FAILURE,
+        }
+    }
+    for shape in shapes::SHAPES {
+        let mut room = [0.0; shapes::COEFFICIENTS];
+        let model = shape.model(&mut room).expect("a model");
+        match bits::bits(&model, steps) {
+            Some((predicted, hash)) => {
+                println!("{} {predicted} of {steps} {hash:016x}", shape.name);
+            }
             None => return ExitCode::FAILURE,
         }
     }

@@ -235,7 +235,7 @@ struct Watched {
 }
 
 impl Updates for Watched {
-    fn receive(&mut self, request: &Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
         if let Ask::Chunk { offset, bytes, .. } = &request.ask {
             self.chunks.borrow_mut().push((*offset, bytes.len()));
         }

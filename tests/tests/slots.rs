@@ -886,6 +886,10 @@ fn what_a_boot_has_decided_stays_decided() {
                     let slot = slot_b(&lab, &image);
                     let unreadable = &slot[cell..cell + 8];
                     let readable = &mark(name, &slot[..64])[..];
+                    if unreadable == readable {
+                        // Cut so late that all of it had been programmed.
+                        continue;
+                    }
                     let (first, later) = if readable_first {
                         (readable, unreadable)
                     } else {

@@ -978,7 +978,7 @@ impl<'m> Controller<'m> {
 
     fn receive(&mut self, number: u8, ask: &Ask) -> Option<Say> {
         let request = Request { number, ask: ask.clone() };
-        let answer = self.updater.receive(&request, self.mode, self.now_us)?;
+        let answer = self.updater.receive(request, self.mode, self.now_us)?;
         assert_eq!(answer.number, number);
         Some(answer.say)
     }
@@ -1092,7 +1092,7 @@ fn requests_are_answered_in_the_modes_specified() {
             assert_eq!(busy, mode == Mode::Running && row[2] == "Busy", "{ask:?}, {mode:?}");
         }
         let request = Request { number: 7, ask: ask.clone() };
-        let answer = NoUpdates.receive(&request, Mode::Idle, 0);
+        let answer = NoUpdates.receive(request, Mode::Idle, 0);
         let say = Say::Refused(Refused::Unknown { variant: 5 });
         assert_eq!(answer, Some(Answer { number: 7, say }));
     }

@@ -8,6 +8,7 @@
 //! | [`gram`], [`solve`], [`edmd`] | the least-squares problem in constant memory |
 //! | [`chain`] | dictionaries that list their terms one by one |
 //! | [`export`] | powers instead of Hermite polynomials, f32, the blob, files written whole |
+//! | [`fixed_point`] | a blob's model in 32-bit integers, and how far off it is |
 //! | [`score`], [`arx`], [`unicycle`] | rollouts over windows beside no motion, a linear ARX and a unicycle |
 //! | [`rollout`] | rollouts in f64 or f32, and their errors over test logs |
 //! | [`select`], [`library`] | the search for the best rollout that fits a controller |
@@ -24,6 +25,8 @@
 //! | [`signing`] | keys, and signed releases of models |
 //! | [`resample`] | logs on a regular time grid |
 
+#![forbid(unsafe_code)]
+
 pub mod arx;
 pub mod chain;
 pub mod conformal;
@@ -34,6 +37,7 @@ pub mod edmd_dl;
 pub mod exchange;
 pub mod export;
 pub mod figures;
+pub mod fixed_point;
 pub mod flash;
 pub mod forecast;
 pub mod full_operator;

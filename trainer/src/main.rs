@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use clap::{Args, Parser, Subcommand};
 use firmware_core::blob;
 use firmware_core::model::{Model, Space, Structure};
+use firmware_core::q31;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use trainer::conformal::{CoverageReport, Residuals, Unit, least_units, with_bounds};
@@ -18,6 +19,10 @@ use trainer::cross_conformal::CrossResiduals;
 use trainer::edmd;
 use trainer::export::{controller_coefficients, export, write_whole};
 use trainer::figures;
+use trainer::fixed_point::{
+    self, FixedCoordinate, FixedError, FixedInput, FixedInspection, FixedOptions, OnLogs, OneStep,
+    fixed_point,
+};
 use trainer::full_operator::FullOperator;
 use trainer::inspect::{Inspection, blocks, inspect};
 use trainer::monitor::{Recorder, listen, picture};
@@ -49,6 +54,7 @@ enum Command {
     Fit(FitArgs),
     Evaluate(EvaluateArgs),
     Inspect(InspectArgs),
+    Export(ExportArgs),
     Calibrate(CalibrateArgs),
     Stability(StabilityArgs),
     Select(SelectArgs),
@@ -217,6 +223,44 @@ struct InspectArgs {
     /// Show every term of the equations, not only the largest.
     #[arg(long)]
     all: bool,
+    /// Print JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Put a blob in fixed point, for controllers without a floating-point unit (firmware_core::q31).
+///
+/// Prints the scale of every coordinate and input, and how far one step is off at random samples within
+/// the trained range; with --logs also rollouts over these.
+#[derive(Args)]
+struct ExportArgs {
+    /// The blob.
+    model: PathBuf,
+    /// In fixed point: 32-bit integers of stated scales.
+    #[arg(long, required = true)]
+    q31: bool,
+    /// Where the new blob is written.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// How much wider than the trained range full scale is, on each side, as a share of the range.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.25)]
+    margin: f64,
+    /// Full scale of a coordinate on R or an input, in its unit, from the centre of its range [default: the
+    /// trained range and the margin; else the limits; else 256 steps of the longest change]. May be repeated.
+    #[arg(long, value_name = "NAME=VALUE")]
+    full_scale: Vec<String>,
+    /// Also compare rollouts over these logs with those in f32.
+    #[arg(long, value_name = "DIR")]
+    logs: Option<PathBuf>,
+    /// The robot.toml that names the columns [default: as for evaluate].
+    #[arg(long, value_name = "FILE", requires = "logs")]
+    robot: Option<PathBuf>,
+    /// Steps of a rollout [default: as in robot.toml, or 50].
+    #[arg(long, value_name = "N", requires = "logs", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    horizon: Option<u32>,
+    /// Samples between the starts of two rollouts [default: as in robot.toml, or 10].
+    #[arg(long, value_name = "N", requires = "logs", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    stride: Option<u32>,
     /// Print JSON instead of text.
     #[arg(long)]
     json: bool,
@@ -404,6 +448,7 @@ fn main() -> ExitCode {
         Command::Evaluate(args) => evaluate(&args),
         Command::Monitor(args) => monitor(&args),
         Command::Inspect(args) => show_blob(&args),
+        Command::Export(args) => export_model(&args),
         Command::Calibrate(args) => calibrate(&args),
         Command::Stability(args) => stability(&args),
         Command::Select(args) => select_model(&args),
@@ -692,7 +737,7 @@ impl BlobFile {
 
 fn refused(path: &Path, error: blob::ParseError) -> Failure {
     use blob::ParseError::{
-        Checksum, Magic, SelfTest, Trailing, Truncated, UnknownSection, Version,
+        Checksum, FixedPoint, Magic, SelfTest, Trailing, Truncated, UnknownSection, Version,
     };
     let reason = match error {
         Magic => {
@@ -714,6 +759,11 @@ fn refused(path: &Path, error: blob::ParseError) -> Failure {
         }
         Checksum { .. } => {
             "the checksum does not match: the file is damaged; copy or fit it again".to_owned()
+        }
+        FixedPoint => {
+            "a model in fixed point; only `trainer inspect` reads one, and a controller by q31::parse; give the \
+             blob that it was made from"
+                .to_owned()
         }
         UnknownSection { kind, .. } => {
             format!(
@@ -1128,7 +1178,10 @@ struct InspectReport<'i> {
 
 fn show_blob(args: &InspectArgs) -> Result<(), Failure> {
     let file = BlobFile::read(&args.model)?;
-    let inspection = inspect(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let inspection = match inspect(file.bytes()) {
+        Err(blob::ParseError::FixedPoint) => return show_fixed_point(args, file.bytes()),
+        inspection => inspection.map_err(|e| refused(&args.model, e))?,
+    };
     if args.json {
         return print_json(&InspectReport {
             format: 1,
@@ -1137,6 +1190,116 @@ fn show_blob(args: &InspectArgs) -> Result<(), Failure> {
         });
     }
     print(&inspection.text(args.all))
+}
+
+/// `export --json`.
+#[derive(Serialize)]
+struct ExportReport<'r> {
+    format: u32,
+    command: &'static str,
+    robot: &'r str,
+    model: String,
+    bytes: usize,
+    coefficients: usize,
+    coordinates: &'r [FixedCoordinate],
+    inputs: &'r [FixedInput],
+    one_step: &'r OneStep,
+    /// Of --logs.
+    logs: Option<&'r OnLogs>,
+}
+
+fn export_model(args: &ExportArgs) -> Result<(), Failure> {
+    let file = BlobFile::read(&args.model)?;
+    let model = firmware_core::parse(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    let test = blob::self_test(file.bytes()).map_err(|e| refused(&args.model, e))?;
+    if args.out.extension().is_some_and(|e| e == "toml" || e == "csv")
+        || args
+            .out
+            .canonicalize()
+            .ok()
+            .is_some_and(|out| args.model.canonicalize().ok() == Some(out))
+    {
+        let out = args.out.display();
+        return Err(Failure(format!(
+            "{out}: must not take the place of the model, a description or a log; give --out FILE.q31"
+        )));
+    }
+    if !(args.margin.is_finite() && (0.0..=100.0).contains(&args.margin)) {
+        return Err(Failure(format!("--margin {}: expected a number from 0 to 100", args.margin)));
+    }
+    let mut options = FixedOptions { margin: args.margin, full_scales: Vec::new() };
+    for given in &args.full_scale {
+        let value =
+            given.split_once('=').and_then(|(name, v)| Some((name, v.trim().parse().ok()?)));
+        let (name, value) = value.ok_or_else(|| {
+            format!("--full-scale {given}: expected NAME=VALUE, such as x=10, in the unit of x")
+        })?;
+        options.full_scales.push((name.trim().to_owned(), value));
+    }
+    let failed = |error: FixedError| Failure(format!("{}: {error}", args.model.display()));
+    let export = fixed_point(&model, &test, &options).map_err(failed)?;
+    let fixed = BlobFile::aligned(&export.bytes);
+    let fixed = q31::parse(fixed.bytes()).map_err(|e| failed(e.into()))?;
+    let one_step = fixed_point::compare(&model, &fixed).map_err(failed)?;
+    let logs = match &args.logs {
+        None => None,
+        Some(logs) => {
+            let place = (args.model.as_path(), args.robot.as_ref());
+            let (schema, options, _) = log_schema(place, (args.horizon, args.stride), &model)?;
+            let recording = Recording::open(logs)?;
+            let trajectories = collect(&Logs { recording: &recording, schema: &schema })?;
+            let found = fixed_point::compare_on_logs(&model, &fixed, &trajectories, &options);
+            Some(found.ok_or_else(|| {
+                format!(
+                    "{}: no trajectory is longer than {} steps; lower --horizon",
+                    logs.display(),
+                    options.horizon
+                )
+            })?)
+        }
+    };
+    write_whole(&args.out, |file| file.write_all(&export.bytes))?;
+    if args.json {
+        return print_json(&ExportReport {
+            format: 1,
+            command: "export",
+            robot: fixed.robot(),
+            model: args.out.display().to_string(),
+            bytes: export.bytes.len(),
+            coefficients: export.coefficients,
+            coordinates: &export.coordinates,
+            inputs: &export.inputs,
+            one_step: &one_step,
+            logs: logs.as_ref(),
+        });
+    }
+    print(&format!(
+        "{}: {}, {} bytes, {}",
+        args.out.display(),
+        fixed.robot(),
+        grouped(export.bytes.len() as u64),
+        fixed_point::text(&export, &one_step, logs.as_ref())
+    ))
+}
+
+/// `inspect --json` of a blob in fixed point.
+#[derive(Serialize)]
+struct InspectFixedReport<'i> {
+    format: u32,
+    command: &'static str,
+    fixed_point: &'i FixedInspection,
+}
+
+fn show_fixed_point(args: &InspectArgs, bytes: &[u8]) -> Result<(), Failure> {
+    let inspection = fixed_point::inspect(bytes).map_err(|e| match e {
+        q31::LoadError::Blob(error) => refused(&args.model, error),
+        other => Failure(format!("{}: {other:?}", args.model.display())),
+    })?;
+    if args.json {
+        let (format, command) = (1, "inspect");
+        return print_json(&InspectFixedReport { format, command, fixed_point: &inspection });
+    }
+    print(&inspection.text())
 }
 
 /// `spectrum --json`.

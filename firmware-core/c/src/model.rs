@@ -2,17 +2,16 @@
 
 use core::ffi::{c_char, c_void};
 
-use firmware_core::Model;
-use firmware_core::blob;
+use firmware_core::{Model, PredictorState, blob};
 
 use crate::error::answer;
 use crate::error::koopman_error_t::{self, *};
 use crate::pointer::{Marked, array_mut, bytes, check, overlap, put, room};
 
 /// Pointers and sizes in a koopman_model_t.
-pub const KOOPMAN_MODEL_POINTERS: usize = 94;
+pub const KOOPMAN_MODEL_POINTERS: usize = 96;
 /// Further words of 32 bits in it.
-pub const KOOPMAN_MODEL_WORDS: usize = 589;
+pub const KOOPMAN_MODEL_WORDS: usize = 633;
 
 /// A Koopman model, checked when it was loaded. The memory is the caller's; what is in it is the
 /// library's. It refers to the blob, and no prediction changes it: any number of states, also
@@ -83,14 +82,16 @@ pub unsafe extern "C" fn koopman_load(
         // SAFETY: `room` was asked; the rest is the caller's word.
         unsafe { Marked::<Loaded>::clear(model)? };
         let bytes = bytes?;
-        let parsed = firmware_core::parse(bytes);
-        let loaded = parsed.as_ref().map_err(|error| *error)?;
+        // SAFETY: as above.
+        let loaded = unsafe { Marked::<Loaded>::place(model, Model::empty)? };
+        blob::parse_into(bytes, loaded, &mut PredictorState::new())?;
         // SAFETY: the caller's word.
         if !(robot.is_null() || unsafe { is_text(robot, loaded.structure().robot()) }) {
             return Err(KOOPMAN_ERROR_ANOTHER_ROBOT);
         }
-        // SAFETY: as above; a model owns nothing.
-        unsafe { Marked::write(model, MARK, loaded) }
+        // SAFETY: it was placed there.
+        unsafe { Marked::<Loaded>::mark(model, MARK) };
+        Ok(())
     })
 }
 

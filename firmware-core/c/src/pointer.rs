@@ -118,6 +118,32 @@ impl<T> Marked<T> {
         Ok(())
     }
 
+    /// Makes an object there, still without its mark: it is never on the stack.
+    ///
+    /// # Safety
+    /// As [`write`](Self::write), and during `'a`.
+    pub(crate) unsafe fn place<'a, O>(
+        pointer: *mut O,
+        make: impl FnOnce() -> T,
+    ) -> Result<&'a mut T, koopman_error_t> {
+        // SAFETY: as the caller says.
+        unsafe { Self::clear(pointer)? };
+        let to = pointer.wrapping_byte_add(offset_of!(Self, object)).cast::<T>();
+        // SAFETY: not null, aligned, large enough; what was there has nothing to be dropped.
+        unsafe { to.write(make()) };
+        // SAFETY: as above; the caller lends it.
+        Ok(unsafe { &mut *to })
+    }
+
+    /// Says that there is one.
+    ///
+    /// # Safety
+    /// It was made by [`place`](Self::place), and no one else touches it.
+    pub(crate) unsafe fn mark<O>(pointer: *mut O, mark: u32) {
+        // SAFETY: as above; the mark is the first field.
+        unsafe { pointer.cast::<u32>().write(mark) };
+    }
+
     /// Says that there is none.
     ///
     /// # Safety

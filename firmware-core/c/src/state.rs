@@ -10,7 +10,7 @@ use crate::pointer::{Marked, array, array_mut, check, overlap, put, room};
 /// Pointers and sizes in a koopman_state_t.
 pub const KOOPMAN_STATE_POINTERS: usize = 4;
 /// Further words of 32 bits in it.
-pub const KOOPMAN_STATE_WORDS: usize = 307;
+pub const KOOPMAN_STATE_WORDS: usize = 308;
 
 /// All that moves while a predictor works: the samples that a prediction looks at, measured or
 /// predicted. The memory is the caller's; what is in it is the library's. A copy (`ahead = state`) is

@@ -223,6 +223,7 @@ where
     /// # Errors
     /// [`ControlLoopError`]: the model is not one of three states and two inputs, or a setting is out of
     /// range.
+    #[inline(always)]
     pub fn new(
         model: &'m Model<'a>,
         (actuators, encoders, sensor): (A, E, S),
@@ -328,6 +329,7 @@ where
     }
 
     /// What a robot that stands still does not carry on.
+    #[inline(never)]
     fn forget(&mut self) {
         for side in &mut self.sides {
             side.integral = 0.0;

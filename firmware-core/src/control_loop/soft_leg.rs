@@ -131,6 +131,7 @@ where
     /// # Errors
     /// [`ControlLoopError`]: the model is not one of two states and two inputs, or a setting is out of
     /// range.
+    #[inline(always)]
     pub fn new(
         model: &'m Model<'a>,
         actuators: A,

@@ -218,6 +218,15 @@ impl Timing {
     }
 }
 
+/// A [`Command`] whose inputs are elsewhere.
+#[derive(Clone, Copy, Debug)]
+enum Order {
+    Start,
+    Inputs,
+    Stop,
+    Reset,
+}
+
 /// The state machine.
 ///
 /// ```
@@ -315,26 +324,44 @@ impl Supervisor {
         wanted: &mut [f32; M],
         tracker: &Tracker<'_, '_, N, M, H>,
     ) {
-        match command {
-            Command::Start if tracker.sees() => {
+        let (order, inputs) = match &command {
+            Command::Start => (Order::Start, &[][..]),
+            Command::Inputs(inputs) => (Order::Inputs, inputs.as_slice()),
+            Command::Stop => (Order::Stop, &[][..]),
+            Command::Reset => (Order::Reset, &[][..]),
+        };
+        self.obey(order, inputs, wanted, tracker.sees(), tracker.model());
+    }
+
+    /// [`follow`](Self::follow), which a controller has once, whatever loops it runs.
+    #[inline(never)]
+    fn obey(
+        &mut self,
+        order: Order,
+        inputs: &[f32],
+        wanted: &mut [f32],
+        sees: bool,
+        model: &Model<'_>,
+    ) {
+        match order {
+            Order::Start if sees => {
                 if self.mode == Mode::Idle {
-                    *wanted = [0.0; M];
+                    wanted.fill(0.0);
                 }
                 self.start();
             }
-            Command::Start => {}
-            Command::Inputs(inputs) if inputs.iter().all(|u| u.is_finite()) => {
-                let inputs_of_model = tracker.model().structure().inputs().iter();
-                let ranges = inputs_of_model.map(|input| input.range);
+            Order::Start => {}
+            Order::Inputs if inputs.iter().all(|u| u.is_finite()) => {
+                let ranges = model.structure().inputs().iter().map(|input| input.range);
                 for ((to, u), [low, high]) in wanted.iter_mut().zip(inputs).zip(ranges) {
                     // Written so that no range, however strange, makes it panic.
                     *to = u.max(low).min(high);
                 }
                 self.heard();
             }
-            Command::Inputs(_) => self.raise(Alarms::BAD_COMMAND),
-            Command::Stop => self.stop(),
-            Command::Reset => self.reset(),
+            Order::Inputs => self.raise(Alarms::BAD_COMMAND),
+            Order::Stop => self.stop(),
+            Order::Reset => self.reset(),
         }
     }
 
@@ -380,6 +407,17 @@ impl Supervisor {
         now_us: u64,
         actuators: &mut impl Actuators<M>,
     ) -> Mode {
+        self.end(now_us);
+        if self.mode != Mode::Running && actuators.stop().is_err() {
+            self.raise(Alarms::ACTUATOR);
+        }
+        self.switched_off = self.mode != Mode::Running;
+        self.mode
+    }
+
+    /// Was the tick in time?
+    #[inline(never)]
+    fn end(&mut self, now_us: u64) {
         let began_us = self.began_us.unwrap_or(now_us);
         match now_us.checked_sub(began_us) {
             None => self.raise(Alarms::CLOCK),
@@ -390,18 +428,14 @@ impl Supervisor {
                 }
             }
         }
-        if self.mode != Mode::Running && actuators.stop().is_err() {
-            self.raise(Alarms::ACTUATOR);
-        }
-        self.switched_off = self.mode != Mode::Running;
-        self.mode
     }
 
     /// A frame with what is known here: mode, alarms, what was noticed and the longest tick since the
     /// frame before.
-    pub fn report(&mut self, frame: Frame) -> Frame {
-        let (worst_tick_us, noticed) = (self.take_worst_us(), self.take_recent());
-        Frame { mode: self.mode, alarms: self.alarms, noticed, worst_tick_us, ..frame }
+    pub fn report(&mut self, mut frame: Frame) -> Frame {
+        (frame.mode, frame.alarms) = (self.mode, self.alarms);
+        (frame.worst_tick_us, frame.noticed) = (self.take_worst_us(), self.take_recent());
+        frame
     }
 
     /// The longest tick since the last call (µs).

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::capacity::{MAX_INPUTS, MAX_STATES};
 use crate::control_loop::supervisor::{Alarms, Mode};
 use crate::control_loop::tracker::Tracked;
+use crate::encoding::Writer;
 
 /// One sample.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -48,6 +49,7 @@ pub struct Frame {
 }
 
 /// A list of a slice, which is not longer than its capacity.
+#[inline(never)]
 fn list<const C: usize>(numbers: &[f32]) -> Vec<f32, C> {
     numbers.iter().copied().take(C).collect()
 }
@@ -88,8 +90,9 @@ impl<'q> Telemetry<'q> {
 
     /// Numbers a frame, as [`Supervisor::report`](crate::control_loop::Supervisor::report) made it, and
     /// puts it into the queue; drops it when the queue is full.
-    pub fn send(&mut self, frame: Frame) {
-        let frame = Frame { sequence: self.sequence, dropped: self.dropped, ..frame };
+    #[inline(never)]
+    pub fn send(&mut self, mut frame: Frame) {
+        (frame.sequence, frame.dropped) = (self.sequence, self.dropped);
         self.sequence = self.sequence.wrapping_add(1);
         if self.queue.enqueue(frame).is_err() {
             self.dropped = self.dropped.saturating_add(1);
@@ -111,18 +114,56 @@ impl Frame {
         tracked: &Tracked<N>,
         path: &[[f32; N]],
     ) -> Self {
-        let optional = |x: &Option<[f32; N]>| list(x.as_ref().map_or(&[], |x| x.as_slice()));
-        Self {
+        let optional = |x| Option::as_ref(x).map_or(&[][..], <[f32; N]>::as_slice);
+        let mut frame = Self {
             time_us,
-            applied: list(applied),
-            measured: optional(&tracked.measured),
-            predicted: optional(&tracked.predicted),
-            residual: optional(&tracked.residual),
             steps: tracked.steps,
             bound_steps: tracked.bound_steps,
-            ahead: list(path.last().map_or(&[], |x| x.as_slice())),
             ..Self::default()
+        };
+        frame.list(
+            applied,
+            optional(&tracked.measured),
+            optional(&tracked.predicted),
+            optional(&tracked.residual),
+            path.last().map_or(&[], |x| x.as_slice()),
+        );
+        frame
+    }
+
+    /// As postcard writes it.
+    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
+        to.word(self.sequence);
+        to.long(self.time_us);
+        to.byte(self.mode as u8);
+        to.word(self.alarms.bits().into());
+        to.word(self.noticed.bits().into());
+        to.numbers(&self.applied);
+        for list in [&self.measured, &self.predicted, &self.residual] {
+            to.numbers(list);
         }
+        to.word(self.steps);
+        to.word(self.bound_steps);
+        to.numbers(&self.ahead);
+        to.word(self.worst_tick_us);
+        to.word(self.dropped);
+    }
+
+    /// Takes the lists: a controller has this once, whatever loops it runs.
+    #[inline(never)]
+    fn list(
+        &mut self,
+        applied: &[f32],
+        measured: &[f32],
+        predicted: &[f32],
+        residual: &[f32],
+        ahead: &[f32],
+    ) {
+        self.applied = list(applied);
+        self.measured = list(measured);
+        self.predicted = list(predicted);
+        self.residual = list(residual);
+        self.ahead = list(ahead);
     }
 }
 

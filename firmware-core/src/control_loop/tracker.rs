@@ -7,6 +7,7 @@
 //! second one begins where all samples that the model looks at are measured: with gaps closer together
 //! than that, only the first one watches.
 
+use crate::capacity::MAX_STATES;
 use crate::control_loop::ControlLoopError;
 use crate::control_loop::monitor::{GATE, Monitor, Verdict};
 use crate::control_loop::supervisor::Alarms;
@@ -66,27 +67,7 @@ pub struct Tracked<const N: usize> {
 /// stand in for them.
 #[derive(Clone, Debug)]
 pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
-    predictor: Predictor<'m, 'a>,
-    state: PredictorState,
-    /// Where the next samples are predicted; nothing in it is kept.
-    trial: PredictorState,
-    monitor: Monitor,
-    /// A prediction without corrections, its monitor, and its length.
-    shadow: PredictorState,
-    slow: Monitor,
-    shadow_steps: u32,
-    /// Samples without a measurement that was used, and the most of them that are allowed.
-    blind: u32,
-    blind_limit: u32,
-    /// Samples in a row for which nothing was predicted, and the most of them that are allowed.
-    unpredicted: u32,
-    unpredicted_limit: u32,
-    /// Which of the last samples were predicted, a bit each, the newest the lowest, as many as the model
-    /// looks at.
-    guessed: u32,
-    looks_at: u32,
-    bad: u8,
-    outliers: u8,
+    beside: Beside<'m, 'a>,
     path: [[f32; N]; H],
     /// How much of the path is there.
     ahead: usize,
@@ -98,6 +79,7 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
     ///
     /// # Errors
     /// [`ControlLoopError::DimensionMismatch`].
+    #[inline(always)]
     pub fn new(model: &'m Model<'a>, blind_samples: u32) -> Result<Self, ControlLoopError> {
         let structure = model.structure();
         for (field, expected, found) in
@@ -107,35 +89,12 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
                 return Err(ControlLoopError::DimensionMismatch { field, expected, found });
             }
         }
-        let reach = model.error_bounds().and_then(|bounds| bounds.horizons().last().copied());
-        let monitor = model.error_bounds().map_or_else(Monitor::default, Monitor::new);
-        let blind_limit = reach.map_or(blind_samples, |reach| reach.min(blind_samples));
-        let fills = u32::try_from(structure.lag()).unwrap_or(u32::MAX).saturating_add(1);
-        Ok(Self {
-            predictor: Predictor::new(model),
-            state: PredictorState::new(),
-            trial: PredictorState::new(),
-            monitor,
-            shadow: PredictorState::new(),
-            slow: monitor,
-            shadow_steps: reach.map_or(SHADOW, |reach| reach.min(SHADOW)),
-            blind: 0,
-            blind_limit,
-            unpredicted: 0,
-            unpredicted_limit: blind_limit.saturating_add(fills),
-            guessed: 0,
-            // At least the present sample; lags are few.
-            looks_at: u32::MAX >> (31 - structure.lag().min(31)),
-            bad: 0,
-            outliers: 0,
-            path: [[0.0; N]; H],
-            ahead: 0,
-        })
+        Ok(Self { beside: Beside::new(model, blind_samples), path: [[0.0; N]; H], ahead: 0 })
     }
 
     /// The model.
     pub fn model(&self) -> &'m Model<'a> {
-        self.predictor.model()
+        self.beside.model()
     }
 
     /// Whether measured and predicted can be compared: the model has error bounds.
@@ -158,8 +117,8 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
     /// Whether the last sample had a measurement that was used, and measurements come often enough for the
     /// model to predict.
     pub fn sees(&self) -> bool {
-        let predicts = self.unpredicted <= self.unpredicted_limit;
-        self.blind == 0 && predicts && !self.state.history().is_empty()
+        let Beside { blind, unpredicted, unpredicted_limit, .. } = self.beside;
+        blind == 0 && unpredicted <= unpredicted_limit && !self.beside.state.history().is_empty()
     }
 
     /// Where the robot will be at each of the coming samples with the inputs held; shorter than `H`
@@ -176,11 +135,140 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         measured: Measurement<N>,
         held: &[f32; M],
     ) -> Tracked<N> {
+        let (mut predicted, mut residual) = ([0.0; N], [0.0; N]);
+        let (reading, mut measured) = match measured {
+            Measurement::Taken(coordinates) => (Reading::Taken, coordinates),
+            Measurement::Missing => (Reading::Missing, [0.0; N]),
+            Measurement::Late => (Reading::Late, [0.0; N]),
+            Measurement::Unreadable => (Reading::Unreadable, [0.0; N]),
+        };
+        let rows = Rows {
+            predicted: &mut predicted,
+            measured: &mut measured,
+            residual: &mut residual,
+            path: self.path.as_flattened_mut(),
+        };
+        let seen = self.beside.sample(applied, reading, held, rows);
+        self.ahead = seen.ahead;
+        Tracked {
+            predicted: seen.predicted.then_some(predicted),
+            measured: seen.used.then_some(measured),
+            residual: seen.compared.then_some(residual),
+            steps: seen.steps,
+            bound_steps: seen.bound_steps,
+            ratio: seen.ratio,
+            alarms: seen.alarms,
+        }
+    }
+
+    /// Forgets the residuals that have added up, not the history.
+    pub fn forget_residuals(&mut self) {
+        self.beside.forget_residuals();
+    }
+}
+
+/// A [`Measurement`] whose coordinates are elsewhere.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Reading {
+    Taken,
+    Missing,
+    Late,
+    Unreadable,
+}
+
+/// Where the numbers of a sample are, shape `[states]`, and its path, shape `[samples, states]`.
+struct Rows<'r> {
+    predicted: &'r mut [f32],
+    measured: &'r mut [f32],
+    residual: &'r mut [f32],
+    path: &'r mut [f32],
+}
+
+/// Which of them there are, and the rest of a [`Tracked`].
+#[derive(Clone, Copy, Debug)]
+struct Seen {
+    predicted: bool,
+    used: bool,
+    compared: bool,
+    ahead: usize,
+    steps: u32,
+    bound_steps: u32,
+    ratio: f32,
+    alarms: Alarms,
+}
+
+/// A tracker of any number of coordinates and inputs: a controller has it once, whatever loops it runs.
+#[derive(Clone, Debug)]
+struct Beside<'m, 'a> {
+    predictor: Predictor<'m, 'a>,
+    state: PredictorState,
+    /// Where the next samples are predicted; nothing in it is kept.
+    trial: PredictorState,
+    monitor: Monitor,
+    /// A prediction without corrections, its monitor, and its length.
+    shadow: PredictorState,
+    slow: Monitor,
+    shadow_steps: u32,
+    /// Samples without a measurement that was used, and the most of them that are allowed.
+    blind: u32,
+    blind_limit: u32,
+    /// Samples in a row for which nothing was predicted, and the most of them that are allowed.
+    unpredicted: u32,
+    unpredicted_limit: u32,
+    /// Which of the last samples were predicted, a bit each, the newest the lowest, as many as the model
+    /// looks at.
+    guessed: u32,
+    looks_at: u32,
+    bad: u8,
+    outliers: u8,
+}
+
+impl<'m, 'a> Beside<'m, 'a> {
+    #[inline(always)]
+    fn new(model: &'m Model<'a>, blind_samples: u32) -> Self {
+        let lag = model.structure().lag();
+        let reach = model.error_bounds().and_then(|bounds| bounds.horizons().last().copied());
+        let monitor = model.error_bounds().map_or_else(Monitor::default, Monitor::new);
+        let blind_limit = reach.map_or(blind_samples, |reach| reach.min(blind_samples));
+        let fills = u32::try_from(lag).unwrap_or(u32::MAX).saturating_add(1);
+        let shadow_steps = reach.map_or(SHADOW, |reach| reach.min(SHADOW));
+        Self {
+            predictor: Predictor::new(model),
+            monitor,
+            slow: monitor,
+            shadow_steps,
+            blind: 0,
+            blind_limit,
+            unpredicted: 0,
+            unpredicted_limit: blind_limit.saturating_add(fills),
+            guessed: 0,
+            // At least the present sample; lags are few.
+            looks_at: u32::MAX >> (31 - lag.min(31)),
+            bad: 0,
+            outliers: 0,
+            // Last: what is a kilobyte each is then made in its place.
+            state: PredictorState::new(),
+            trial: PredictorState::new(),
+            shadow: PredictorState::new(),
+        }
+    }
+
+    fn model(&self) -> &'m Model<'a> {
+        self.predictor.model()
+    }
+
+    /// [`Tracker::sample`]. A measurement that is taken is turned into (−π, π] where it lies.
+    #[inline(never)]
+    fn sample(&mut self, applied: &[f32], reading: Reading, held: &[f32], rows: Rows<'_>) -> Seen {
+        let Rows { predicted, measured, residual, path } = rows;
         let mut alarms = Alarms::none();
         self.trial.clone_from(&self.state);
-        let mut predicted = None;
+        let mut is_predicted = false;
         match self.predictor.step(&mut self.trial, applied) {
-            Ok(()) => predicted = Some(self.coordinates(&self.trial)),
+            Ok(()) => {
+                self.coordinates(&self.trial, predicted);
+                is_predicted = true;
+            }
             Err(PredictError::NotReady { .. }) => {}
             // Inputs are finite and of the right number: what is left is divergence.
             Err(_) => alarms |= Alarms::DIVERGED,
@@ -188,76 +276,75 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         if self.trial.out_of_range().is_some() {
             alarms |= Alarms::OUT_OF_RANGE;
         }
-        self.unpredicted = match predicted {
-            Some(_) => 0,
-            None => self.unpredicted.saturating_add(1),
-        };
+        self.unpredicted = if is_predicted { 0 } else { self.unpredicted.saturating_add(1) };
         if self.unpredicted > self.unpredicted_limit {
             alarms |= Alarms::SENSOR_LOST;
         }
-        let steps = predicted.map_or(0, |_| self.trial.step());
+        let steps = if is_predicted { self.trial.step() } else { 0 };
         let guesses = (self.guessed & self.looks_at).count_ones();
-        let bound_steps = if predicted.is_some() { steps.max(1 + guesses) } else { 0 };
+        let bound_steps = if is_predicted { steps.max(1 + guesses) } else { 0 };
 
-        let taken = match measured {
-            Measurement::Taken(x) if x.iter().all(|x| x.is_finite()) => {
+        let is_taken = match reading {
+            Reading::Taken if measured.iter().all(|x| x.is_finite()) => {
                 self.bad = 0;
-                Some(self.turned(x))
+                self.turn(measured);
+                true
             }
-            Measurement::Missing => None,
-            Measurement::Late => {
+            Reading::Missing => false,
+            Reading::Late => {
                 alarms |= Alarms::SENSOR_LATE;
-                None
+                false
             }
-            Measurement::Taken(_) | Measurement::Unreadable => {
+            Reading::Taken | Reading::Unreadable => {
                 self.bad = self.bad.saturating_add(1);
                 if self.bad >= BAD_MEASUREMENTS {
                     alarms |= Alarms::SENSOR_BAD;
                 }
-                None
+                false
             }
         };
-        let residual = taken.zip(predicted).map(|(x, expected)| self.residual(&x, &expected));
-        let verdict = match (residual, self.model().error_bounds()) {
-            (Some(residual), Some(bounds)) => self.monitor.update(bounds, bound_steps, &residual),
+        let is_compared = is_taken && is_predicted;
+        if is_compared {
+            self.compare(measured, predicted, residual);
+        }
+        let verdict = match self.model().error_bounds() {
+            Some(bounds) if is_compared => self.monitor.update(bounds, bound_steps, residual),
             _ => Verdict::default(),
         };
         if verdict.alarm {
             alarms |= Alarms::RESIDUAL;
         }
         let believed = verdict.ratio <= GATE || self.outliers >= OUTLIERS;
-        if taken.is_some() {
+        if is_taken {
             self.outliers = if believed { 0 } else { self.outliers + 1 };
         }
-        let used = taken.filter(|_| believed);
-        if self.beside(applied, used) {
+        let is_used = is_taken && believed;
+        if self.beside(applied, is_used.then_some(&*measured)) {
             alarms |= Alarms::RESIDUAL;
         }
-        self.guessed = (self.guessed << 1) | u32::from(used.is_none());
-        match used {
-            Some(x) => {
-                if verdict.ratio > GATE {
-                    // The robot really is elsewhere: its history belongs to the place before.
-                    self.state = PredictorState::new();
-                    self.guessed = 0;
-                }
-                // Finite, and of the right length: it cannot be refused.
-                let _ = self.predictor.observe(&mut self.state, applied, &x);
-                self.blind = 0;
+        self.guessed = (self.guessed << 1) | u32::from(!is_used);
+        if is_used {
+            if verdict.ratio > GATE {
+                // The robot really is elsewhere: its history belongs to the place before.
+                self.state.clear();
+                self.guessed = 0;
             }
-            None => {
-                if taken.is_some() {
-                    alarms |= Alarms::OUTLIER;
-                }
-                self.blind = self.blind.saturating_add(1);
-                if self.blind > self.blind_limit {
-                    alarms |= Alarms::SENSOR_LOST;
-                }
-                // A gap in a history that was not full, or no prediction: begin anew.
-                match predicted {
-                    Some(_) => self.state.clone_from(&self.trial),
-                    None => self.state = PredictorState::new(),
-                }
+            // Finite, and of the right length: it cannot be refused.
+            let _ = self.predictor.observe(&mut self.state, applied, measured);
+            self.blind = 0;
+        } else {
+            if is_taken {
+                alarms |= Alarms::OUTLIER;
+            }
+            self.blind = self.blind.saturating_add(1);
+            if self.blind > self.blind_limit {
+                alarms |= Alarms::SENSOR_LOST;
+            }
+            // A gap in a history that was not full, or no prediction: begin anew.
+            if is_predicted {
+                self.state.clone_from(&self.trial);
+            } else {
+                self.state.clear();
             }
         }
 
@@ -265,13 +352,13 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
             // It starts from measurements alone: what it is compared with are the bounds of those.
             match self.guessed & self.looks_at {
                 0 => self.shadow.clone_from(&self.state),
-                _ => self.shadow = PredictorState::new(),
+                _ => self.shadow.clear(),
             }
         }
 
         self.trial.clone_from(&self.state);
-        self.ahead = 0;
-        for place in &mut self.path {
+        let mut ahead = 0;
+        for place in path.chunks_exact_mut(predicted.len().max(1)) {
             match self.predictor.step(&mut self.trial, held) {
                 Ok(()) => {}
                 Err(PredictError::NotReady { .. }) => break,
@@ -280,64 +367,69 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
                     break;
                 }
             }
-            let _ = self.predictor.coordinates(&self.trial, place);
-            self.ahead += 1;
+            self.coordinates(&self.trial, place);
+            ahead += 1;
         }
-        let ratio = verdict.ratio;
-        Tracked { predicted, measured: used, residual, steps, bound_steps, ratio, alarms }
+        Seen {
+            predicted: is_predicted,
+            used: is_used,
+            compared: is_compared,
+            ahead,
+            steps,
+            bound_steps,
+            ratio: verdict.ratio,
+            alarms,
+        }
     }
 
     /// Moves the second prediction on; at its end, whether it has been too far off too often.
-    fn beside(&mut self, applied: &[f32; M], used: Option<[f32; N]>) -> bool {
+    fn beside(&mut self, applied: &[f32], used: Option<&[f32]>) -> bool {
         if self.predictor.step(&mut self.shadow, applied).is_err() {
             // Its history is not full, or it diverged, which the first prediction does not miss.
-            self.shadow = PredictorState::new();
+            self.shadow.clear();
             return false;
         }
         if self.shadow.step() < self.shadow_steps {
             return false;
         }
-        let expected = self.coordinates(&self.shadow);
-        match (used, self.model().error_bounds()) {
-            (Some(x), Some(bounds)) => {
-                let residual = self.residual(&x, &expected);
-                self.slow.update(bounds, self.shadow.step(), &residual).alarm
-            }
-            _ => false,
-        }
+        let (Some(x), Some(bounds)) = (used, self.model().error_bounds()) else { return false };
+        let (mut expected, mut residual) = ([0.0; MAX_STATES], [0.0; MAX_STATES]);
+        // No model has more states.
+        let expected = expected.get_mut(..x.len()).unwrap_or_default();
+        let residual = residual.get_mut(..x.len()).unwrap_or_default();
+        self.coordinates(&self.shadow, expected);
+        self.compare(x, expected, residual);
+        self.slow.update(bounds, self.shadow.step(), residual).alarm
     }
 
-    /// Forgets the residuals that have added up, not the history.
-    pub fn forget_residuals(&mut self) {
+    fn forget_residuals(&mut self) {
         self.monitor.reset();
         self.slow.reset();
-        self.shadow = PredictorState::new();
+        self.shadow.clear();
     }
 
-    fn coordinates(&self, state: &PredictorState) -> [f32; N] {
-        let mut x = [0.0; N];
+    #[inline(never)]
+    fn coordinates(&self, state: &PredictorState, out: &mut [f32]) {
         // Of the right length: it cannot be refused.
-        let _ = self.predictor.coordinates(state, &mut x);
-        x
+        let _ = self.predictor.coordinates(state, out);
     }
 
     /// Coordinates with angles in (−π, π]: sensors count turns, and the trainer wraps the angles of a
     /// log before it narrows them to f32.
-    fn turned(&self, mut x: [f32; N]) -> [f32; N] {
+    fn turn(&self, x: &mut [f32]) {
         for (x, state) in x.iter_mut().zip(self.model().structure().states()) {
             if state.space == Space::Circle {
                 *x = x.wrap();
             }
         }
-        x
     }
 
-    fn residual(&self, measured: &[f32; N], predicted: &[f32; N]) -> [f32; N] {
-        let mut residual = [0.0; N];
+    /// Measured − predicted.
+    #[inline(never)]
+    fn compare(&self, measured: &[f32], predicted: &[f32], residual: &mut [f32]) {
         let pairs = measured.iter().zip(predicted).zip(self.model().structure().states());
         for (to, ((x, expected), state)) in residual.iter_mut().zip(pairs) {
             *to = state.space.difference(*x, *expected);
         }
-        residual
     }
 }

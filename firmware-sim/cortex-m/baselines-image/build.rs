@@ -24,7 +24,11 @@ fn main() {
     let opt_level = env::var("OPT_LEVEL").expect("cargo sets it");
     println!("cargo:rustc-env=LEVEL=O{opt_level}");
     // The memory map is that of the other images.
-    println!("cargo:rustc-link-search={}/..", env!("CARGO_MANIFEST_DIR"));
+    let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
+    let memory = concat!(env!("CARGO_MANIFEST_DIR"), "/../netduinoplus2.x");
+    std::fs::copy(memory, out.join("memory.x")).expect("the memory map of the other images");
+    println!("cargo:rustc-link-search={}", out.display());
+    println!("cargo:rerun-if-changed={memory}");
     println!("cargo:rerun-if-changed=build.rs");
     println!("cargo:rerun-if-env-changed=CMSIS_DSP");
     println!("cargo:rerun-if-env-changed=CMSIS_CORE");

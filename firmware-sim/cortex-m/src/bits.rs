@@ -39,7 +39,7 @@ fn hash(hash: u64, word: u32) -> u64 {
     (hash ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01B3)
 }
 
-/// Predicts `steps` samples, in rollouts of eight after random measurements, with random inputs, some of
+/// Predicts `steps` samples, in rollouts of eight after random measurements, and the same with one input held, with random inputs, some of
 /// them beyond their range; how many did not diverge, and the hash of all coordinates and of every error.
 pub fn bits(model: &Model<'_>, steps: u32) -> Option<(u32, u64)> {
     let structure = model.structure();
@@ -64,6 +64,22 @@ pub fn bits(model: &Model<'_>, steps: u32) -> Option<(u32, u64)> {
                     *u = random.number(input.range[1]);
                 }
                 predictor.observe(&mut state, applied.get(..m)?, coordinates).ok()?;
+            }
+            let mut path = [0.0; ROLLOUT as usize * firmware_core::capacity::MAX_STATES];
+            let path = path.get_mut(..ROLLOUT as usize * n)?;
+            let mut ahead = state.clone();
+            let held = predictor.rollout_held(&mut ahead, applied.get(..m)?, path);
+            for x in path {
+                result = hash(result, x.to_bits());
+            }
+            ahead.clone_from(&state);
+            let end = predictor.hold(&mut ahead, applied.get(..m)?, ROLLOUT as usize);
+            if held != end {
+                return None;
+            }
+            predictor.coordinates(&ahead, coordinates).ok()?;
+            for x in coordinates {
+                result = hash(result, x.to_bits());
             }
         }
         let mut input = [0.0; firmware_core::capacity::MAX_INPUTS];

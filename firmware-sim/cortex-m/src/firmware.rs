@@ -10,8 +10,7 @@ use embedded_io::{ErrorType as IoErrorType, Read, ReadReady, Write, WriteReady};
 use embedded_storage::nor_flash::{
     ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
-use firmware_core::Model;
-use firmware_core::blob::Aligned;
+use firmware_core::blob::{Aligned, parse_into};
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
 use firmware_core::control_loop::telemetry::Queue;
@@ -20,6 +19,7 @@ use firmware_core::device::{EncoderCount, PositionSensor};
 use firmware_core::link::Port;
 use firmware_core::slots::{Geometry, Payload};
 use firmware_core::update::{Capacities, Identity, Trust, Updater};
+use firmware_core::{Model, PredictorState};
 
 static ROSBOT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/skid-rosbot/model.bin"));
 static LEG: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/soft-leg/model.bin"));
@@ -141,8 +141,9 @@ impl NorFlash for Nowhere {
 }
 
 /// One of two robots; never comes back.
-pub fn run(trust: impl Trust + Copy) -> Option<()> {
-    if black_box(true) { rosbot(trust) } else { leg(trust) }
+pub fn run(trust: impl Trust) -> Option<()> {
+    let goes_on = || true;
+    if black_box(true) { rosbot(trust, Nowhere, goes_on) } else { leg(trust, Nowhere, goes_on) }
 }
 
 fn identity(
@@ -153,9 +154,21 @@ fn identity(
     Identity { firmware: "image", robot, factory, capacities, erase_ms: 4_000, good_ticks: 1_000 }
 }
 
-/// The model of the ROSbot.
-pub fn rosbot_model() -> Option<Model<'static>> {
-    firmware_core::parse_for("skid-rosbot", &ROSBOT.0).ok()
+#[inline(never)]
+fn no_model() -> Model<'static> {
+    Model::empty()
+}
+
+/// The model of the ROSbot, where it is to be.
+pub fn rosbot_model(model: &mut Model<'static>) -> Option<()> {
+    load(model, "skid-rosbot", &ROSBOT.0)
+}
+
+/// Loads the model of a robot; the state in which its prediction is tried is off the stack afterwards.
+#[inline(never)]
+fn load(model: &mut Model<'static>, robot: &str, blob: &'static [u8]) -> Option<()> {
+    parse_into(blob, model, &mut PredictorState::new()).ok()?;
+    (model.structure().robot() == robot).then_some(())
 }
 
 /// Its loop.
@@ -171,8 +184,8 @@ pub fn rosbot_loop<'m, 'q>(
 }
 
 /// The model of the leg.
-pub fn leg_model() -> Option<Model<'static>> {
-    firmware_core::parse_for("soft-leg", &LEG.0).ok()
+pub fn leg_model(model: &mut Model<'static>) -> Option<()> {
+    load(model, "soft-leg", &LEG.0)
 }
 
 /// Its loop.
@@ -190,39 +203,55 @@ pub fn leg_loop<'m, 'q>(
     SoftLeg::<_, _, 20>::new(model, pneumatics, Nowhere, settings, telemetry).ok()
 }
 
+/// The ROSbot as long as it `goes_on`, asked at every tick.
 #[inline(never)]
-fn rosbot(trust: impl Trust) -> Option<()> {
-    let model = rosbot_model()?;
+pub fn rosbot<S: Read + ReadReady + Write + WriteReady>(
+    trust: impl Trust,
+    serial: S,
+    goes_on: impl FnMut() -> bool,
+) -> Option<()> {
+    let mut model = no_model();
+    rosbot_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut robot = rosbot_loop(&model, Telemetry::new(producer))?;
     let capacities = Capacities::new::<3, 2>(100_000, 0);
-    serve(&mut robot, trust, identity("skid-rosbot", &ROSBOT.0, capacities), &mut frames)
+    let identity = identity("skid-rosbot", &ROSBOT.0, capacities);
+    serve(&mut robot, trust, identity, &mut frames, serial, goes_on)
 }
 
+/// The leg.
 #[inline(never)]
-fn leg(trust: impl Trust) -> Option<()> {
-    let model = leg_model()?;
+pub fn leg<S: Read + ReadReady + Write + WriteReady>(
+    trust: impl Trust,
+    serial: S,
+    goes_on: impl FnMut() -> bool,
+) -> Option<()> {
+    let mut model = no_model();
+    leg_model(&mut model)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut leg = leg_loop(&model, Telemetry::new(producer))?;
     let capacities = Capacities::new::<2, 2>(50_000, 0);
-    serve(&mut leg, trust, identity("soft-leg", &LEG.0, capacities), &mut frames)
+    let identity = identity("soft-leg", &LEG.0, capacities);
+    serve(&mut leg, trust, identity, &mut frames, serial, goes_on)
 }
 
+#[inline(never)]
 fn serve(
-    robot: &mut impl ControlLoop<2>,
+    robot: &mut dyn ControlLoop<2>,
     trust: impl Trust,
     identity: Identity<'static>,
     frames: &mut firmware_core::control_loop::telemetry::Frames<'_>,
+    mut serial: impl Read + ReadReady + Write + WriteReady,
+    mut goes_on: impl FnMut() -> bool,
 ) -> Option<()> {
     let geometry = Geometry { offset: 0, slot_bytes: 128 * 1024 };
     let accept = |payload: Payload| black_box(payload.length) > 0;
     let booted = Updater::boot(Nowhere, geometry, identity, 0, trust, accept);
     let (mut updater, _) = booted.ok()?;
     let mut port = Port::new();
-    let mut serial = Nowhere;
-    while !(updater.resets() && port.is_sent()) {
+    while goes_on() && !(updater.resets() && port.is_sent()) {
         let now_us = black_box(0);
         port.receive(&mut serial, robot, &mut updater, now_us);
         robot.tick(now_us);

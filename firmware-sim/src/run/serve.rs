@@ -11,7 +11,7 @@ use crate::run::scenario::Scenario;
 use crate::run::store::Store;
 use crate::run::summary::Summary;
 use crate::run::{RunError, with};
-use embedded_io::{Read as _, ReadReady as _, Write as _};
+use embedded_io::ReadReady;
 use firmware_core::control_loop::Frame;
 use firmware_core::link::MAX_FRAME;
 use firmware_core::model::Model;
@@ -89,9 +89,9 @@ impl Door {
     }
 }
 
-/// The client at the other end of the line.
-struct Remote {
-    end: UartEnd,
+/// The client at the other end of the line, of which we hold `end`.
+pub(crate) struct Remote<E> {
+    end: E,
     door: Door,
     client: Option<TcpStream>,
     /// A frame that the client has not sent to its end.
@@ -103,7 +103,18 @@ struct Remote {
     speed: f64,
 }
 
-impl Remote {
+impl<E: embedded_io::Read + ReadReady + embedded_io::Write> Remote<E> {
+    /// A client at the door. With `drives`, the host's script drives the robot.
+    pub(crate) fn new(end: E, door: Door, host: Host, (drives, speed): (bool, f64)) -> Self {
+        let (incoming, outgoing, began) = (Vec::new(), Vec::new(), Instant::now());
+        Self { end, door, client: None, incoming, outgoing, host, drives, began, speed }
+    }
+
+    /// Our end of the line.
+    pub(crate) fn end(&mut self) -> &mut E {
+        &mut self.end
+    }
+
     /// Passes bytes on, both ways, as far as the client goes along.
     fn exchange(&mut self) {
         if let (Door::Tcp(listener), None) = (&self.door, &self.client)
@@ -147,7 +158,7 @@ impl Remote {
     }
 }
 
-impl Laptop for Remote {
+impl<E: embedded_io::Read + ReadReady + embedded_io::Write> Laptop for Remote<E> {
     fn turn(
         &mut self,
         now_us: u64,
@@ -192,16 +203,6 @@ pub fn serve(
     door: Door,
     (drives, speed): (bool, f64),
 ) -> Result<Summary, RunError> {
-    let laptop = |end, _: &Faults, host| Remote {
-        end,
-        door,
-        client: None,
-        incoming: Vec::new(),
-        outgoing: Vec::new(),
-        host,
-        drives,
-        began: Instant::now(),
-        speed,
-    };
+    let laptop = |end: UartEnd, _: &Faults, host| Remote::new(end, door, host, (drives, speed));
     with(model, scenario, seed, Some(store), laptop, &mut |_| Ok(()))
 }

@@ -2,7 +2,9 @@
 
 use std::f32::consts::PI;
 
-use firmware_core::blob::{EmitError, ParseError, SelfTest, emit, length, self_test, size};
+use firmware_core::blob::{
+    Aligned, EmitError, ParseError, SelfTest, emit, length, parse_into, self_test, size,
+};
 use firmware_core::model::{Model, Space};
 use firmware_core::{PredictError, Predictor, PredictorState, parse, parse_for, parse_prefix};
 
@@ -11,9 +13,16 @@ const STEPS: usize = 6;
 /// What a rollout leaves alone keeps this value, a NaN that no arithmetic makes.
 const UNTOUCHED: u32 = 0x7FED_CBA9;
 
+static OTHER: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/soft-leg/model.bin"));
+
 /// Everything that reads a blob, and that it agrees with itself.
 pub fn read(bytes: &[u8]) {
     let (whole, prefix, test) = (parse(bytes), parse_prefix(bytes), self_test(bytes));
+    // Into a place where another model was.
+    let (mut model, mut state) = (parse(&OTHER.0).expect("a blob"), PredictorState::new());
+    assert_eq!(parse_into(bytes, &mut model, &mut state).err(), whole.as_ref().err().copied());
+    assert_eq!(model, whole.clone().unwrap_or(Model::empty()));
+    assert_eq!(state, PredictorState::new());
     if let Some(beyond) = bytes.get(1..) {
         assert!(parse_prefix(beyond).is_err(), "misaligned");
     }

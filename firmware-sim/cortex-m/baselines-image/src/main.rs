@@ -5,6 +5,8 @@
 //! in its place. All must give the numbers of the formula in f64, or the image names the first
 //! that does not, and fails.
 //!
+//! Ours fail, too, if they take more than [`MOST`] says.
+//!
 //! The model is the paper's differential drive: x, y, sine and cosine of the heading, two wheel speeds. The
 //! baselines get the six values centred and scaled, and do nothing but lift and product. Ours is
 //! the public step, with everything that makes it a prediction on the robot: history, inputs and trained
@@ -17,17 +19,17 @@ use core::hint::black_box;
 
 use cortex_m_rt::entry;
 use cortex_m_semihosting::hprintln;
-use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
-use firmware_core::model::{
-    Input, ModelRepr, Provenance, Space, State, Structure, Symmetry, Target,
-};
-use firmware_core::{Model, Predictor, PredictorState, Scalar};
+use firmware_core::kernel::{Run, fold, fold_portable};
+use firmware_core::{Predictor, PredictorState, Scalar};
 use nalgebra::{SMatrix, Vector2};
 
 #[path = "../../src/machine.rs"]
 mod machine;
+#[path = "../../src/shapes.rs"]
+mod shapes;
 
-use machine::count;
+use machine::{count, stack};
+use shapes::{COEFFICIENTS, DRIVE, DRIVE_SE2, LEG, Shape};
 
 const VARIABLES: usize = 6;
 const TERMS: usize = 64;
@@ -49,12 +51,23 @@ const LEVEL: &str = concat!(", ", env!("LEVEL"));
 const MEASURED: [f32; STATES] = [0.8, -0.7, 0.7];
 /// Wheel speeds \[rad/s\].
 const INPUT: [f32; 2] = [12.0, 7.0];
-/// Centre and gain of x, y, sine, cosine and the wheel speeds, as `standardise` makes them.
-const SCALING: [[f32; 2]; VARIABLES] =
-    [[0.3, 1.9], [-0.2, 1.7], [0.0, 1.0], [0.0, 1.0], [5.0, 0.13], [4.0, 0.25]];
-/// Trained ranges of the same.
-const RANGES: [[f32; 2]; VARIABLES] =
-    [[-4.0, 4.0], [-4.0, 4.0], [-1.0, 1.0], [-1.0, 1.0], [-60.0, 60.0], [-60.0, 60.0]];
+/// Bytes of stack that a step of the drive may take.
+const STACK: usize = 128;
+/// Instructions that ours may take.
+const MOST: [(&str, f32); 6] = [
+    (PORTABLE, 570.0),
+    (ON_CIRCLE, 310.0),
+    (STEP, 380.0),
+    (HOLD, 190.0),
+    (LEG_FOLD, 60.0),
+    (SE2_STEP, 200.0),
+];
+const PORTABLE: &str = "`kernel::fold_portable`";
+const ON_CIRCLE: &str = "`kernel::fold`, back on the circle";
+const STEP: &str = "`Predictor::step`";
+const HOLD: &str = "`Predictor::hold`, a step of ten";
+const LEG_FOLD: &str = "soft leg, `kernel::fold`";
+const SE2_STEP: &str = "drive by its pose, `Predictor::step`";
 
 type Values = [f32; VARIABLES];
 /// Outputs slowest, as in a model.
@@ -86,6 +99,34 @@ extern "C" fn kronecker(
     *outputs = (operator * lift).into();
 }
 
+/// All axes.
+const ALL: Run = Run::new(2, VARIABLES as u8).unwrap();
+
+extern "C" fn folded(values: &Values, operator: &Operator, outputs: &mut Outputs) {
+    fold(ALL, operator.as_flattened(), outputs, values);
+}
+
+extern "C" fn portable(values: &Values, operator: &Operator, outputs: &mut Outputs) {
+    fold_portable(ALL, operator.as_flattened(), outputs, values);
+}
+
+fn leg_folded(coefficients: &[f32], outputs: &mut [f32; STATES]) {
+    const RUN: Run = Run::new(2, 4).unwrap();
+    let [outputs @ .., _] = outputs;
+    fold(RUN, coefficients, outputs, &[0.5, -0.5, 0.25, 0.75]);
+}
+
+fn pose_folded(coefficients: &[f32], outputs: &mut [f32; STATES]) {
+    const RUN: Run = Run::new(4, 2).unwrap();
+    fold(RUN, coefficients, outputs, &[0.5, -0.5]);
+}
+
+extern "C" fn folded_on_circle(values: &Values, operator: &Operator, outputs: &mut Outputs) {
+    fold(ALL, operator.as_flattened(), outputs, values);
+    let [_, _, angle @ ..] = outputs;
+    f32::on_circle(angle);
+}
+
 extern "C" fn nothing<O>(_: &Values, _: &O, _: &mut Outputs) {}
 
 #[entry]
@@ -95,7 +136,10 @@ fn main() -> ! {
 
 fn compare() -> Option<()> {
     let per_tick = machine::instructions_per_tick()?;
-    let operator = operator();
+    let mut room = [0.0; COEFFICIENTS];
+    let model = DRIVE.model(&mut room)?;
+    let mut operator = [[0.0; TERMS]; OUTPUTS];
+    operator.as_flattened_mut().copy_from_slice(model.coefficients());
     let (values, outputs, coordinates) = expected(&operator);
 
     let c = |name: &str, kernel: Kernel<Operator>| {
@@ -114,12 +158,78 @@ fn compare() -> Option<()> {
     let nalgebra = ("Rust", "nalgebra, `kronecker` and product");
     baseline(nalgebra, per_tick, kronecker, (&values, &matrix), &outputs)?;
 
-    let ranges = RANGES.as_flattened();
-    let model = Model::new(structure()?, operator.as_flattened(), Some(ranges)).ok()?;
+    let kernel = ("Rust", PORTABLE);
+    baseline(kernel, per_tick, portable, (&values, &operator), &outputs)?;
+    let kernel = ("Rust", "`kernel::fold`");
+    baseline(kernel, per_tick, folded, (&values, &operator), &outputs)?;
+    let [.., sin, cos] = outputs;
+    let length = (sin * sin + cos * cos).root();
+    let [x, y, sin, cos] = outputs;
+    let kernel = ("Rust", ON_CIRCLE);
+    let on_circle = [x, y, sin / length, cos / length];
+    baseline(kernel, per_tick, folded_on_circle, (&values, &operator), &on_circle)?;
+
     let predictor = Predictor::new(&model);
     let [first, .., last] = coordinates;
-    ours("`Predictor::step`", per_tick, &predictor, step, 1, &first)?;
-    ours("`Predictor::rollout_held`, a step of ten", per_tick, &predictor, rollout, HORIZON, &last)
+    ours(STEP, per_tick, &predictor, step, 1, &first)?;
+    let mut state = PredictorState::new();
+    predictor.observe(&mut state, &[], &MEASURED).ok()?;
+    let (stepped, bytes) = stack(|| black_box(step)(&predictor, &mut state, &INPUT, &mut []));
+    hprintln!("Stack;{}", bytes);
+    if !stepped || bytes > STACK {
+        return None;
+    }
+    ours(
+        "`Predictor::rollout_held`, a step of ten",
+        per_tick,
+        &predictor,
+        rollout,
+        HORIZON,
+        &last,
+    )?;
+    ours(HOLD, per_tick, &predictor, hold, HORIZON, &last)?;
+    let names = ["soft leg, `Predictor::step`", "soft leg, `Predictor::hold`, a step of ten"];
+    other(&LEG, (LEG_FOLD, leg_folded), names, per_tick)?;
+    let names = [SE2_STEP, "drive by its pose, `Predictor::hold`, a step of ten"];
+    other(&DRIVE_SE2, ("drive by its pose, `kernel::fold`", pose_folded), names, per_tick)
+}
+
+/// Folds the coefficients of a shape.
+type OwnFold = fn(&[f32], &mut [f32; STATES]);
+
+/// Counts another shape: its kernel, a step, and a rollout, which has to lead where the steps do.
+fn other(
+    shape: &Shape,
+    (name, kernel): (&str, OwnFold),
+    [one, ten]: [&str; 2],
+    per_tick: f32,
+) -> Option<()> {
+    let mut room = [0.0; COEFFICIENTS];
+    let model = shape.model(&mut room)?;
+    let mut outputs = [0.0; STATES];
+    let mut repeat = |work: OwnFold| {
+        count(|| {
+            for _ in 0..REPETITIONS {
+                work(black_box(model.coefficients()), black_box(&mut outputs));
+            }
+        })
+    };
+    let without = repeat(black_box(|_, _| {}));
+    let with = repeat(black_box(kernel));
+    report(("Rust", name), (with - without) as f32 * per_tick, [].into_iter())?;
+
+    let predictor = Predictor::new(&model);
+    let n = model.structure().states().len();
+    let mut state = PredictorState::new();
+    predictor.observe(&mut state, &[], MEASURED.get(..n)?).ok()?;
+    let mut all = [[0.0; STATES]; HORIZON];
+    for end in &mut all {
+        predictor.step(&mut state, &INPUT).ok()?;
+        predictor.coordinates(&state, end.get_mut(..n)?).ok()?;
+    }
+    let [first, .., last] = all.map(|end| end.map(f64::from));
+    ours(one, per_tick, &predictor, step, 1, &first)?;
+    ours(ten, per_tick, &predictor, hold, HORIZON, &last)
 }
 
 /// Counts a kernel, and compares its numbers.
@@ -164,6 +274,15 @@ fn rollout(
     predictor.rollout_held(state, input, path).is_ok()
 }
 
+fn hold(
+    predictor: &Predictor<'_, '_>,
+    state: &mut PredictorState,
+    input: &[f32],
+    _: &mut [f32],
+) -> bool {
+    predictor.hold(state, input, HORIZON).is_ok()
+}
+
 fn idle(_: &Predictor<'_, '_>, _: &mut PredictorState, _: &[f32], _: &mut [f32]) -> bool {
     true
 }
@@ -178,7 +297,8 @@ fn ours(
     expected: &[f64; STATES],
 ) -> Option<()> {
     let mut start = PredictorState::new();
-    predictor.observe(&mut start, &[], &MEASURED).ok()?;
+    let n = predictor.model().structure().states().len();
+    predictor.observe(&mut start, &[], MEASURED.get(..n)?).ok()?;
     let mut state = start.clone();
     let mut path = [0.0; STATES * HORIZON];
     let mut repeat = |work: Work| {
@@ -194,7 +314,7 @@ fn ours(
     let without = repeat(black_box(idle))?;
     let with = repeat(black_box(work))?;
     let mut found = [0.0; STATES];
-    predictor.coordinates(&state, &mut found).ok()?;
+    predictor.coordinates(&state, found.get_mut(..n)?).ok()?;
     if state.out_of_range().is_some() {
         hprintln!("{}: not in range", name);
         return None;
@@ -216,34 +336,14 @@ fn report(
     }
     // Names in C say their level themselves.
     let level = if language == "Rust" { LEVEL } else { "" };
-    hprintln!("{};{}{};{:.0}", language, name, level, instructions / REPETITIONS as f32);
+    let instructions = instructions / REPETITIONS as f32;
+    hprintln!("{};{}{};{:.0}", language, name, level, instructions);
+    let most = MOST.iter().find(|(kernel, _)| *kernel == name).map(|(_, most)| *most);
+    if most.is_some_and(|most| instructions > most) {
+        hprintln!("{}: more than {:.0} instructions", name, most.unwrap_or(0.0));
+        return None;
+    }
     Some(())
-}
-
-/// What a robot standing still would need, and every term besides, by numbers that are all over the place.
-fn operator() -> Operator {
-    let mut bits = 1_u32;
-    let mut operator = [[0.0; TERMS]; OUTPUTS];
-    for coefficient in operator.as_flattened_mut() {
-        // xorshift (Marsaglia 2003). At least a hundredth, that no term goes unnoticed.
-        bits ^= bits << 13;
-        bits ^= bits >> 17;
-        bits ^= bits << 5;
-        let size = 0.01 + 0.02 * (bits >> 8) as f32 / 16_777_216.0;
-        *coefficient = if bits & 1 == 0 { size } else { -size };
-    }
-    let [x, y, sin, cos] = &mut operator;
-    for (i, row) in [x, y, sin, cos].into_iter().enumerate() {
-        let [centre, gain] = SCALING[i];
-        row[0] += centre;
-        row[variable_bit(i)] += 1.0 / gain;
-    }
-    operator
-}
-
-/// The bit of a term's index that says whether the term has the variable; the first one is the slowest.
-fn variable_bit(variable: usize) -> usize {
-    1 << (VARIABLES - 1 - variable)
 }
 
 /// By the formula in f64: values and outputs of the first step, coordinates after every step.
@@ -254,63 +354,22 @@ fn expected(operator: &Operator) -> (Values, [f64; OUTPUTS], [[f64; STATES]; HOR
     let (mut raw, mut first) = ([x, y, sin, cos, right, left], None);
     let coordinates = [(); HORIZON].map(|()| {
         let mut values = raw;
-        for (v, scaling) in values.iter_mut().zip(SCALING) {
+        for (v, scaling) in values.iter_mut().zip(DRIVE.scaling) {
             let [centre, gain] = scaling.map(f64::from);
             *v = (*v - centre) * gain;
         }
         let term = |t: usize| -> f64 {
-            let factors = values.iter().enumerate().filter(|(i, _)| t & variable_bit(*i) != 0);
+            let factors = values.iter().enumerate().filter(|(i, _)| t & DRIVE.term(*i) != 0);
             factors.map(|(_, v)| v).product()
         };
         let outputs: [f64; OUTPUTS] =
             operator.map(|row| row.iter().enumerate().map(|(t, c)| f64::from(*c) * term(t)).sum());
         first.get_or_insert((values.map(|v| v as f32), outputs));
         let [x, y, sin, cos] = outputs;
-        let onto_circle = (sin * sin + cos * cos).reciprocal_root();
+        let onto_circle = 1.0 / (sin * sin + cos * cos).root();
         raw = [x, y, sin * onto_circle, cos * onto_circle, right, left];
         [x, y, sin.atan2(cos)]
     });
     let (values, outputs) = first.unwrap_or_default();
     (values, outputs, coordinates)
-}
-
-/// That of the paper's drive, `trainer/paper/drive.toml`, with centred and scaled variables.
-fn structure() -> Option<Structure<'static>> {
-    let state =
-        |name, unit, space, limit| State { name, unit, space, target: Target::Absolute, limit };
-    let input = |name| Input { name, unit: "rad/s", range: [-60.0, 60.0] };
-    let sources = [
-        Source::State(0),
-        Source::State(1),
-        Source::Sin(2),
-        Source::Cos(2),
-        Source::Input(0),
-        Source::Input(1),
-    ];
-    let observables = sources.into_iter().zip(SCALING).map(|(source, [centre, gain])| Observable {
-        source,
-        lag: 0,
-        centre,
-        gain,
-    });
-    let factors = (0..6).map(|observable| Factor { observable, basis: Basis::Hermite, order: 1 });
-    Structure::try_from(ModelRepr {
-        robot: "paper-drive",
-        sample_time_s: 0.1,
-        states: [
-            state("x", "m", Space::Line, [-40.0, 40.0]),
-            state("y", "m", Space::Line, [-40.0, 40.0]),
-            // As `fit` leaves an angle.
-            state("phi", "rad", Space::Circle, [f32::NEG_INFINITY, f32::INFINITY]),
-        ]
-        .into_iter()
-        .collect(),
-        inputs: ["omega_r", "omega_l"].map(input).into_iter().collect(),
-        symmetry: Symmetry::None,
-        observables: observables.collect(),
-        factors: factors.collect(),
-        blocks: [Block { factors: 6, max_degree: 0 }].into_iter().collect(),
-        provenance: Provenance { logs: [0; 32], robot: [0; 32] },
-    })
-    .ok()
 }

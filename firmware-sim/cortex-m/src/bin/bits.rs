@@ -20,6 +20,8 @@ mod host;
 mod machine;
 #[path = "../models.rs"]
 mod models;
+#[path = "../shapes.rs"]
+mod shapes;
 
 use models::MODELS;
 
@@ -37,6 +39,11 @@ fn predict() -> Option<()> {
         let (predicted, hash) = bits::bits(&model, steps)?;
         let robot = model.structure().robot();
         hprintln!("{} {} of {} {:016x}", robot, predicted, steps, hash);
+    }
+    for shape in shapes::SHAPES {
+        let mut room = [0.0; shapes::COEFFICIENTS];
+        let (predicted, hash) = bits::bits(&shape.model(&mut room)?, steps)?;
+        hprintln!("{} {} of {} {:016x}", shape.name, predicted, steps, hash);
     }
     Some(())
 }

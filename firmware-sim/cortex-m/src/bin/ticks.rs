@@ -10,6 +10,7 @@ use core::hint::black_box;
 
 use cortex_m_rt::entry;
 use cortex_m_semihosting::hprintln;
+use firmware_core::Model;
 use firmware_core::control_loop::telemetry::{Frames, Queue};
 use firmware_core::control_loop::{Command, ControlLoop, Mode, Telemetry};
 
@@ -32,12 +33,14 @@ fn main() -> ! {
 
 fn measure() -> Option<()> {
     let per_tick = machine::instructions_per_tick()?;
-    let rosbot = firmware::rosbot_model()?;
+    let mut rosbot = Model::empty();
+    firmware::rosbot_model(&mut rosbot)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut robot = firmware::rosbot_loop(&rosbot, Telemetry::new(producer))?;
     one("skid-rosbot", &mut robot, &mut frames, (10_000, 10), per_tick)?;
-    let leg = firmware::leg_model()?;
+    let mut leg = Model::empty();
+    firmware::leg_model(&mut leg)?;
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut robot = firmware::leg_loop(&leg, Telemetry::new(producer))?;
