@@ -1,5 +1,5 @@
-//! What a model predicts from random samples, as a hash of all its bits. The same code runs on the target
-//! and, through tests/examples/target_bits.rs, on the host.
+//! What a model predicts from random samples, and from recorded ones, as a hash of all its bits. The same code
+//! runs on the target and, through tests/examples/target_bits.rs, on the host.
 
 use firmware_core::{Model, Predictor, PredictorState};
 
@@ -101,4 +101,70 @@ pub fn bits(model: &Model<'_>, steps: u32) -> Option<(u32, u64)> {
         }
     }
     Some((predicted, result))
+}
+
+/// Samples that a recorded sequence of inputs is predicted over, again and again.
+const AHEAD: u32 = 10;
+
+/// What is predicted along recorded trajectories.
+pub struct Replay {
+    /// Rollouts of ten samples that came to their end.
+    pub rollouts: u32,
+    /// Of all coordinates on the way.
+    pub hash: u64,
+    /// Mean squared error at the end of a rollout, in the square of the unit.
+    pub error: [f32; firmware_core::capacity::MAX_STATES],
+}
+
+/// Predicts along recorded trajectories with their inputs. `next` puts a sample into its argument, states and
+/// then inputs; NaN where a new trajectory begins; `false` at the end.
+pub fn replay(model: &Model<'_>, mut next: impl FnMut(&mut [f32]) -> bool) -> Option<Replay> {
+    let structure = model.structure();
+    let (n, m) = (structure.states().len(), structure.inputs().len());
+    let predictor = Predictor::new(model);
+    let (mut state, mut ahead) = (PredictorState::new(), PredictorState::new());
+    let mut error = [0.0; firmware_core::capacity::MAX_STATES];
+    let (mut rollouts, mut result) = (0, 0xCBF2_9CE4_8422_2325);
+    let mut sample =
+        [0.0; firmware_core::capacity::MAX_STATES + firmware_core::capacity::MAX_INPUTS];
+    let sample = sample.get_mut(..n + m)?;
+    let mut before = [0.0; firmware_core::capacity::MAX_INPUTS];
+    let before = before.get_mut(..m)?;
+    while next(sample) {
+        let (states, inputs) = sample.split_at_checked(n)?;
+        if states.iter().any(|x| x.is_nan()) {
+            state.clear();
+            ahead.clear();
+            continue;
+        }
+        if !ahead.history().is_empty() {
+            // One that has not been started looks back at too few samples, or has diverged.
+            let made = predictor.step(&mut ahead, before).is_ok();
+            let mut predicted = [0.0; firmware_core::capacity::MAX_STATES];
+            let predicted = predicted.get_mut(..n)?;
+            predictor.coordinates(&ahead, predicted).ok()?;
+            for x in &*predicted {
+                result = hash(result, x.to_bits());
+            }
+            if !made {
+                ahead.clear();
+            } else if ahead.step() == AHEAD {
+                rollouts += 1;
+                for (((sum, x), expected), of) in
+                    error.iter_mut().zip(predicted).zip(states).zip(structure.states())
+                {
+                    let off = of.space.difference(*expected, *x);
+                    *sum += off * off;
+                }
+                ahead.clear();
+            }
+        }
+        predictor.observe(&mut state, before, states).ok()?;
+        if ahead.history().is_empty() && state.history().len() > structure.lag() {
+            ahead.clone_from(&state);
+        }
+        before.copy_from_slice(inputs);
+    }
+    let error = error.map(|sum| sum / rollouts.max(1) as f32);
+    Some(Replay { rollouts, hash: result, error })
 }
