@@ -312,7 +312,8 @@ impl Layout {
         let Self { first_input, lines, groups, .. } = *self;
         let bytes = self.heads.iter().flatten().copied().chain([first_input, lines, groups]);
         let places = self.states.iter().flat_map(|p| [p.x, p.change, p.sin, p.cos]);
-        let bytes = bytes.chain(places);
+        let kinds = [self.increments.into(), self.pose.is_some().into()];
+        let bytes = bytes.chain(places).chain(kinds);
         let trigonometric = (0..self.states.len()).map(|i| (trigonometric >> i) & 1);
         self.id = bytes
             .chain(trigonometric)

@@ -252,8 +252,8 @@ pub trait Scalar:
         true
     }
 
-    /// Scales the values of observables, `v = (raw − centre) · gain`, and compares them with their ranges:
-    /// whether all are inside. `raw` has shape `[n]`, `ranges` shape `[n, 2]`, `scales` with centre and gain
+    /// Scales the values of observables, `v = (raw − centre) · gain`, and compares them, which have to be
+    /// finite, with their ranges: whether all are inside. `raw` has shape `[n]`, `ranges` shape `[n, 2]`, `scales` with centre and gain
     /// shape `[n, 2]`, `v` shape `[n]`.
     #[inline]
     fn observe(raw: &[Self], ranges: &[[Self; 2]], scales: &[[f32; 2]], v: &mut [Self]) -> bool {

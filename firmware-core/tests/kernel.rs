@@ -5,7 +5,7 @@
 mod shapes;
 
 use firmware_core::kernel::{Run, fold, fold_portable};
-use firmware_core::{Model, PredictError, Predictor, PredictorState};
+use firmware_core::{Model, PredictError, Predictor, PredictorState, Structure};
 use proptest::prelude::*;
 use shapes::{COEFFICIENTS, DRIVE, DRIVE_SE2, LEG, SHAPES, Shape};
 
@@ -54,6 +54,20 @@ fn runs_are_polynomials() {
                 assert_eq!(again, expected, "{radix} {count} {tiles}");
             }
         }
+    }
+    // What does not fit together: as far as it goes.
+    let c: Vec<f32> = (0_u8..7).map(f32::from).collect();
+    for (run, v, expected) in [
+        (Run::default(), &[][..], [9.0; 3]),
+        (Run::new(2, 1).unwrap(), &[], [9.0; 3]),
+        (Run::new(2, 1).unwrap(), &[10.0], [10.0, 32.0, 54.0]),
+        (Run::new(2, 2).unwrap(), &[100.0, 10.0], [3210.0, 9.0, 9.0]),
+        (Run::new(9, 1).unwrap(), &[1.0], [9.0; 3]),
+    ] {
+        let (mut folded, mut again) = ([9.0; 3], [9.0; 3]);
+        fold_portable(run, &c, &mut folded, v);
+        fold(run, &c, &mut again, v);
+        assert_eq!((folded, again), (expected, expected), "{run:?}");
     }
     for (radix, count) in [(0, 1), (2, 0), (2, 7), (3, 3), (4, 3), (5, 2), (255, 255)] {
         assert_eq!(Run::new(radix, count), None, "{radix} {count}");
@@ -156,6 +170,25 @@ proptest! {
             hold(shape, seed, 200.0);
         }
     }
+}
+
+/// A further input that nothing observes has to be given, too.
+#[test]
+fn all_inputs_are_asked_for() {
+    let mut room = [0.0; COEFFICIENTS];
+    let model = DRIVE.model(&mut room).unwrap();
+    let mut repr = model.structure().to_repr();
+    let third = *repr.inputs.last().unwrap();
+    repr.inputs.push(third).unwrap();
+    let structure = Structure::try_from(repr).unwrap();
+    let wider = Model::new(structure, model.coefficients(), model.ranges()).unwrap();
+    let predictor = Predictor::new(&wider);
+    let mut state = PredictorState::new();
+    predictor.observe(&mut state, &[], &[0.5; 3]).unwrap();
+    let expected = Err(PredictError::DimensionMismatch { field: "inputs", expected: 3, found: 2 });
+    assert_eq!(predictor.step(&mut state, &[1.0, 2.0]), expected);
+    assert_eq!(predictor.hold(&mut state, &[1.0, 2.0], 2), expected);
+    assert_eq!(predictor.step(&mut state, &[1.0, 2.0, 3.0]), Ok(()));
 }
 
 #[test]

@@ -732,15 +732,14 @@ pub(crate) fn planar_held(constants: &Constants, pose: &mut [f32; 5], outputs: &
 static KERNELS: [unsafe extern "C" fn(*const f32, *mut f32, usize, *const f32); 12] =
     [two_1, two_2, two_3, two_4, two_5, two_6, three_1, three_2, four_1, four_2, five_1, six_1];
 
-/// Folds as many tiles as `to` has room for; whether there is a kernel for the run, and as many numbers as it
-/// takes.
+/// Folds as many tiles as there are coefficients and room for; whether there is a kernel for the run.
 #[inline(always)]
 pub(crate) fn fold(run: Run, from: &[f32], to: &mut [f32], v: &[f32]) -> bool {
     let Some(kernel) = KERNELS.get(usize::from(run.shape)) else { return false };
-    let tiles = to.len();
-    let enough = from.len() >= tiles.wrapping_mul(run.size()) && v.len() >= run.count();
-    if tiles == 0 || !enough {
-        return false;
+    // Those with a kernel have a size.
+    let tiles = to.len().min(from.len().checked_div(run.size()).unwrap_or(0));
+    if tiles == 0 || v.len() < run.count() {
+        return true;
     }
     // SAFETY: there are as many coefficients and values as the kernel reads, `to` has `tiles` numbers, and what
     // is borrowed to be written overlaps nothing.

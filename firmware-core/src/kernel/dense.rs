@@ -16,7 +16,7 @@ const ROOM: usize = 64;
 const FUNCTIONS: usize = 64;
 
 /// Neighbouring polynomial axes with the same number of coefficients: they are folded at once.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Run {
     radix: u8,
     count: u8,
@@ -41,9 +41,16 @@ const SHAPES: [[u8; 2]; 12] = [
     [6, 1],
 ];
 
+impl Default for Run {
+    /// Of no axes: nothing is folded.
+    fn default() -> Self {
+        Self::NONE
+    }
+}
+
 impl Run {
     /// Of no axes.
-    pub(crate) const NONE: Self = Self { radix: 0, count: 0, size: 0, shape: 0 };
+    pub(crate) const NONE: Self = Self { radix: 0, count: 0, size: 0, shape: SHAPES.len() as u8 };
 
     /// Of `count` axes with `radix` coefficients each, order and one: up to six axes of two, two of three or
     /// of four, or a single one.
@@ -166,7 +173,8 @@ fn tiles<T: Tile, S: Scalar>(from: &[S], to: &mut [S], v: &[S]) {
 
 /// Folds a run of axes on any processor: `from` has shape `[tiles, run.size()]`, the last axis the fastest,
 /// `v` shape `[run.count()]`, the slowest axis first, `to` shape `[tiles]`. On every axis that is Horner's scheme
-/// `lo + v · hi`, the fastest axis first, product and sum rounded on their own. [`fold`] is the same, to the
+/// `lo + v · hi`, the fastest axis first, product and sum rounded on their own. As many tiles are folded as there
+/// are coefficients and room for; nothing, if `v` is too short. [`fold`] is the same, to the
 /// bit, as fast as the processor does it.
 ///
 /// ```

@@ -151,8 +151,9 @@ impl Shape {
         };
         let layout = structure.layout();
         match (direct.next, layout.states.as_slice()) {
-            (Next::Values(2), [_, _, _]) if of_runs(Run::new(2, 6)?, Run::new(2, 2)?) => {
-                Some(Self::Drive)
+            // A further input that nothing observes would lie behind the others.
+            (Next::Values(2), [_, _, _]) if layout.inputs() == 2 => {
+                of_runs(Run::new(2, 6)?, Run::new(2, 2)?).then_some(Self::Drive)
             }
             (Next::Pose, [x, y, heading]) => {
                 let run = Run::new(4, 2)?;
