@@ -98,7 +98,7 @@ impl<S: Scalar> History<S> {
     /// How many samples there are for a model of this layout.
     #[inline]
     pub(crate) fn ready(&self, layout: &Layout) -> usize {
-        if self.layout == layout.id { self.filled.into() } else { 0 }
+        if self.is_of(layout) { self.filled.into() } else { 0 }
     }
 
     #[inline]

@@ -470,6 +470,32 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
     }
 }
 
+/// As many steps as are made, their coordinates in the rows of `path`, if it is not empty.
+#[inline(always)]
+fn repeat<S, P>(
+    present: &mut P,
+    steps: usize,
+    path: &mut [S],
+    step: impl Fn(&mut P) -> bool,
+    coordinates: impl Fn(&P) -> [S; 3],
+) -> usize {
+    let mut done = 0_usize;
+    if path.is_empty() {
+        // A loop of its own, because it is the shortest.
+        while done < steps && step(present) {
+            done = done.wrapping_add(1);
+        }
+    }
+    for row in path.as_chunks_mut().0.iter_mut().take(steps) {
+        if !step(present) {
+            break;
+        }
+        *row = coordinates(present);
+        done = done.wrapping_add(1);
+    }
+    done
+}
+
 /// As many steps as there is nothing unusual about, with the inputs held, of a model that the controller has a
 /// kernel for; what the inputs have left of the coefficients begins with register `held`.
 #[inline(never)]
@@ -481,50 +507,24 @@ fn hold_known<S: Scalar>(
     steps: usize,
     path: &mut [S],
 ) -> usize {
-    let is_empty = path.is_empty();
-    let rows = path.as_chunks_mut::<3>().0.iter_mut();
-    let mut done = 0_usize;
     let (registers, held) = state.history.registers_mut().split_at_mut(held);
     let registers = registers.get_mut(FIRST.into()..).unwrap_or_default();
-    match known {
+    let done = match known {
         Known::Drive(ranges, _) => {
             let (Some(held), Some(present)) = (held.first_chunk(), registers.first_chunk_mut())
             else {
                 return 0;
             };
-            for row in rows.take(steps) {
-                if !S::drive_held(constants, ranges, present, held) {
-                    break;
-                }
-                let [x, y, s, c] = *present;
-                *row = [x, y, s.atan2(c)];
-                done = done.wrapping_add(1);
-            }
-            // Shortest where only the end counts.
-            if is_empty {
-                while done < steps && S::drive_held(constants, ranges, present, held) {
-                    done = done.wrapping_add(1);
-                }
-            }
+            let step = |present: &mut _| S::drive_held(constants, ranges, present, held);
+            repeat(present, steps, path, step, |[x, y, s, c]| [*x, *y, s.atan2(*c)])
         }
         Known::Planar(..) => {
             let pose = registers.get_mut(2..).and_then(|pose| pose.first_chunk_mut());
             let (Some(held), Some(pose)) = (held.first_chunk(), pose) else { return 0 };
-            for row in rows.take(steps) {
-                if !S::planar_held(constants, pose, held) {
-                    break;
-                }
-                let [x, y, heading, _, _] = *pose;
-                *row = [x, y, heading];
-                done = done.wrapping_add(1);
-            }
-            if is_empty {
-                while done < steps && S::planar_held(constants, pose, held) {
-                    done = done.wrapping_add(1);
-                }
-            }
+            let step = |pose: &mut _| S::planar_held(constants, pose, held);
+            repeat(pose, steps, path, step, |[x, y, heading, _, _]| [*x, *y, *heading])
         }
-    }
+    };
     state.step = state.step.saturating_add(u32::try_from(done).unwrap_or(u32::MAX));
     done
 }

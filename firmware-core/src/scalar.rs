@@ -12,43 +12,33 @@ use crate::kernel::{cortex_m4f, fold_axis};
 pub(crate) const SHORTEST: f32 = 1.0 / LONGEST;
 pub(crate) const LONGEST: f32 = (1 << 20) as f32;
 
-mod sealed {
+pub(crate) mod sealed {
     use core::cell::Cell;
 
+    use super::Scalar;
     use crate::capacity::REGISTERS;
     use crate::kernel::Constants;
     use crate::registers::FromFirst;
 
+    /// What a controller may have a kernel for: that of a Cortex-M4F is in [`cortex_m4f`](crate::kernel).
     pub trait Sealed: Sized {
-        /// A step of a planar pose from its ranges and coefficients; its registers begin with the two inputs and x, y, heading, its sine and
-        /// cosine: as [`drive`](Self::drive).
-        #[inline(always)]
-        fn planar(
-            _: &Constants,
-            _: &[[Self; 2]; 2],
-            _: &[Self; 48],
-            _: &mut FromFirst<Self>,
-        ) -> bool {
-            false
-        }
-
-        /// The same from the outputs that inputs lead to, which are held.
-        #[inline(always)]
-        fn planar_held(_: &Constants, _pose: &mut [Self; 5], _outputs: &[Self; 3]) -> bool {
-            false
-        }
-
         /// The terms of a sparse model, products of registers, and its first outputs, up to four.
+        #[inline(always)]
         fn terms(
             registers: &[Cell<Self>; REGISTERS],
             products: &[[u8; 2]],
             made: &[Cell<Self>],
             coefficients: &[Self],
             outputs: &mut [Self],
-        );
+        ) where
+            Self: Scalar,
+        {
+            crate::kernel::terms(registers, products, made, coefficients, outputs);
+        }
 
-        /// A step of the paper's drive from its ranges and coefficients; its registers begin with the present sample and the inputs: whether
-        /// it was made. Nothing has changed if not, as on machines without a kernel for it.
+        /// A step of the paper's drive from its ranges and coefficients; its registers begin with the present
+        /// sample and the inputs. Whether it was made: nothing has changed if not, as on machines without a
+        /// kernel for it.
         #[inline(always)]
         fn drive(
             _: &Constants,
@@ -69,83 +59,29 @@ mod sealed {
         ) -> bool {
             false
         }
-    }
-    impl Sealed for f32 {
-        #[cfg(cortex_m4f)]
+
+        /// A step of a planar pose from its ranges and coefficients; its registers begin with the two inputs
+        /// and x, y, heading, its sine and cosine. Whether it was made, as in [`drive`](Self::drive).
         #[inline(always)]
         fn planar(
-            constants: &Constants,
-            ranges: &[[f32; 2]; 2],
-            coefficients: &[f32; 48],
-            registers: &mut FromFirst<f32>,
+            _: &Constants,
+            _: &[[Self; 2]; 2],
+            _: &[Self; 48],
+            _: &mut FromFirst<Self>,
         ) -> bool {
-            crate::kernel::cortex_m4f::planar(constants, ranges, coefficients, registers)
+            false
         }
 
-        #[cfg(cortex_m4f)]
+        /// The same from the outputs that inputs lead to, which are held.
         #[inline(always)]
-        fn planar_held(constants: &Constants, pose: &mut [f32; 5], outputs: &[f32; 3]) -> bool {
-            crate::kernel::cortex_m4f::planar_held(constants, pose, outputs)
-        }
-
-        #[cfg(cortex_m4f)]
-        #[inline(always)]
-        fn terms(
-            registers: &[Cell<f32>; REGISTERS],
-            products: &[[u8; 2]],
-            made: &[Cell<f32>],
-            coefficients: &[f32],
-            outputs: &mut [f32],
-        ) {
-            crate::kernel::cortex_m4f::terms(registers, products, made, coefficients, outputs);
-        }
-
-        #[cfg(not(cortex_m4f))]
-        #[inline(always)]
-        fn terms(
-            registers: &[Cell<f32>; REGISTERS],
-            products: &[[u8; 2]],
-            made: &[Cell<f32>],
-            coefficients: &[f32],
-            outputs: &mut [f32],
-        ) {
-            crate::kernel::terms(registers, products, made, coefficients, outputs);
-        }
-
-        #[cfg(cortex_m4f)]
-        #[inline(always)]
-        fn drive(
-            constants: &Constants,
-            ranges: &[[f32; 2]; 6],
-            coefficients: &[f32; 256],
-            registers: &mut FromFirst<f32>,
-        ) -> bool {
-            crate::kernel::cortex_m4f::drive(constants, ranges, coefficients, registers)
-        }
-
-        #[cfg(cortex_m4f)]
-        #[inline(always)]
-        fn drive_held(
-            constants: &Constants,
-            ranges: &[[f32; 2]; 6],
-            present: &mut [f32; 4],
-            held: &[f32; 64],
-        ) -> bool {
-            crate::kernel::cortex_m4f::drive_held(constants, ranges, present, held)
+        fn planar_held(_: &Constants, _pose: &mut [Self; 5], _outputs: &[Self; 3]) -> bool {
+            false
         }
     }
-    impl Sealed for f64 {
-        #[inline(always)]
-        fn terms(
-            registers: &[Cell<f64>; REGISTERS],
-            products: &[[u8; 2]],
-            made: &[Cell<f64>],
-            coefficients: &[f64],
-            outputs: &mut [f64],
-        ) {
-            crate::kernel::terms(registers, products, made, coefficients, outputs);
-        }
-    }
+
+    #[cfg(not(cortex_m4f))]
+    impl Sealed for f32 {}
+    impl Sealed for f64 {}
 }
 
 /// What the lift needs of a number: addition, subtraction, multiplication.
@@ -253,8 +189,8 @@ pub trait Scalar:
     }
 
     /// Scales the values of observables, `v = (raw − centre) · gain`, and compares them, which have to be
-    /// finite, with their ranges: whether all are inside. `raw` has shape `[n]`, `ranges` shape `[n, 2]`, `scales` with centre and gain
-    /// shape `[n, 2]`, `v` shape `[n]`.
+    /// finite, with their ranges: whether all are inside. `raw` has shape `[n]`, `ranges` shape `[n, 2]`,
+    /// `scales` with centre and gain shape `[n, 2]`, `v` shape `[n]`.
     #[inline]
     fn observe(raw: &[Self], ranges: &[[Self; 2]], scales: &[[f32; 2]], v: &mut [Self]) -> bool {
         let mut inside = true;

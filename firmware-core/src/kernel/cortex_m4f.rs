@@ -15,6 +15,7 @@ use super::direct::Constants;
 use crate::capacity::REGISTERS;
 use crate::history::LONG;
 use crate::registers::FromFirst;
+use crate::scalar::sealed::Sealed;
 use crate::scalar::{COS, HALF_PI, LONGEST, ROUND, SHORTEST, SIN};
 
 /// Loads registers `$first` to `$last`.
@@ -59,6 +60,18 @@ macro_rules! sixteen_at {
     };
     (3 $a:literal $b:literal $c:literal $d:literal) => {
         sixteen!($a $b $c $d; 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18)
+    };
+}
+
+/// Sixty-four coefficients of six axes of two, to register n, the first of three neighbours; their values are in
+/// registers 26 to 31.
+macro_rules! sixty_four_at {
+    ($n:tt $second:tt $third:tt) => {
+        concat!(
+            sixteen_at!($n 28 29 30 31), sixteen_at!($second 28 29 30 31), fold!(27: $n $second),
+            sixteen_at!($second 28 29 30 31), sixteen_at!($third 28 29 30 31),
+            fold!(27: $second $third), fold!(26: $n $second)
+        )
     };
 }
 
@@ -112,13 +125,14 @@ macro_rules! kernel {
     };
 }
 
-kernel!(two_1, 15 15, load!(0 1), fold!(15: 0 1));
 /// Four coefficients of two axes of two, to the first register.
 macro_rules! four {
     ($($s0:literal $s1:literal $s2:literal $s3:literal),+) => {
         concat!($(load!($s0 $s3), fold!(15: $s0 $s1, $s2 $s3), fold!(14: $s0 $s2)),+)
     };
 }
+
+kernel!(two_1, 15 15, load!(0 1), fold!(15: 0 1));
 
 /// As the others, eight tiles at a time as long as there are as many: folding what is held first leaves many.
 ///
@@ -153,9 +167,7 @@ kernel!(two_3, 13 15, load!(0 7), fold!(15: 0 1, 2 3, 4 5, 6 7), fold!(14: 0 2, 
 kernel!(saved two_4, 28 31, sixteen_at!(0 28 29 30 31));
 kernel!(saved two_5, 27 31,
     sixteen_at!(0 28 29 30 31), sixteen_at!(1 28 29 30 31), fold!(27: 0 1));
-kernel!(saved two_6, 26 31,
-    sixteen_at!(0 28 29 30 31), sixteen_at!(1 28 29 30 31), fold!(27: 0 1),
-    sixteen_at!(1 28 29 30 31), sixteen_at!(2 28 29 30 31), fold!(27: 1 2), fold!(26: 0 1));
+kernel!(saved two_6, 26 31, sixty_four_at!(0 1 2));
 kernel!(three_1, 15 15, load!(0 2), fold!(15: 1 2, 0 1));
 kernel!(three_2, 14 15, load!(0 8),
     fold!(15: 1 2, 4 5, 7 8), fold!(15: 0 1, 3 4, 6 7), fold!(14: 3 6, 0 3));
@@ -243,6 +255,74 @@ pub(crate) fn observe(
     outside >> 31 == 0
 }
 
+/// Puts sine and cosine back on the circle, or goes elsewhere if their direction means nothing: their
+/// registers, two more, one for the bits of the square, and where to go.
+macro_rules! on_circle {
+    ($sin:literal $cos:literal, $square:literal $one:literal, $bits:literal, $lost:literal) => {
+        concat!(
+            "vmul.f32 s",
+            $square,
+            ", s",
+            $sin,
+            ", s",
+            $sin,
+            "\n",
+            "vmla.f32 s",
+            $square,
+            ", s",
+            $cos,
+            ", s",
+            $cos,
+            "\n",
+            "vmov ",
+            $bits,
+            ", s",
+            $square,
+            "\n",
+            "sub ",
+            $bits,
+            ", ",
+            $bits,
+            ", #{shortest}\n",
+            "cmp ",
+            $bits,
+            ", #{between}\n",
+            "bhs ",
+            $lost,
+            "\n",
+            "vsqrt.f32 s",
+            $square,
+            ", s",
+            $square,
+            "\n",
+            "vmov.f32 s",
+            $one,
+            ", #1.0\n",
+            "vdiv.f32 s",
+            $square,
+            ", s",
+            $one,
+            ", s",
+            $square,
+            "\n",
+            "vmul.f32 s",
+            $sin,
+            ", s",
+            $sin,
+            ", s",
+            $square,
+            "\n",
+            "vmul.f32 s",
+            $cos,
+            ", s",
+            $cos,
+            ", s",
+            $square,
+            "\n"
+        )
+    };
+}
+
 /// [`Scalar::on_circle`](crate::Scalar::on_circle).
 ///
 /// # Safety
@@ -252,17 +332,7 @@ unsafe extern "C" fn circle(pair: *mut [f32; 2]) -> bool {
     naked_asm!(
         ".fpu fpv4-sp-d16",
         "vldmia r0, {{s0-s1}}",
-        "vmul.f32 s2, s0, s0",
-        "vmla.f32 s2, s1, s1",
-        "vmov r1, s2",
-        "sub r1, r1, #{shortest}",
-        "cmp r1, #{between}",
-        "bhs 2f",
-        "vsqrt.f32 s2, s2",
-        "vmov.f32 s3, #1.0",
-        "vdiv.f32 s2, s3, s2",
-        "vmul.f32 s0, s0, s2",
-        "vmul.f32 s1, s1, s2",
+        on_circle!(0 1, 2 3, "r1", "2f"),
         "vstmia r0, {{s0-s1}}",
         "movs r0, #1",
         "bx lr",
@@ -333,46 +403,6 @@ terms!(terms_3, 10, "add r4, r3, r7, lsl #2", "add r5, r4, r7, lsl #2";
 terms!(terms_4, 11, "add r4, r3, r7, lsl #2", "add r5, r4, r7, lsl #2", "add r6, r5, r7, lsl #2";
     "r3" 4 8, "r4" 5 9, "r5" 6 10, "r6" 7 11);
 
-/// [`Sealed::terms`](crate::scalar::sealed::Sealed::terms).
-#[inline(always)]
-pub(crate) fn terms(
-    registers: &[Cell<f32>; REGISTERS],
-    products: &[[u8; 2]],
-    made: &[Cell<f32>],
-    coefficients: &[f32],
-    outputs: &mut [f32],
-) {
-    let kernel = match outputs.len() {
-        1 => terms_1,
-        2 => terms_2,
-        3 => terms_3,
-        4 => terms_4,
-        _ => return,
-    };
-    let count = products.len();
-    let row = count.wrapping_add(1);
-    let enough = coefficients.len() >= row.wrapping_mul(outputs.len());
-    if count == 0 || made.len() < count || !enough {
-        // The constants alone.
-        for (output, constant) in outputs.iter_mut().zip(coefficients.iter().step_by(row)) {
-            *output = *constant;
-        }
-        return;
-    }
-    // SAFETY: there is as much of everything as is read and written, an index has a byte and finds one of 256
-    // registers, and cells may be written through shared references.
-    unsafe {
-        kernel(
-            registers.as_ptr(),
-            products.as_ptr(),
-            made.as_ptr(),
-            coefficients.as_ptr(),
-            outputs.as_mut_ptr(),
-            count,
-        )
-    };
-}
-
 /// The product of a value's distances from both ends of its range: negative outside.
 macro_rules! range {
     ($($v:literal $low:literal $high:literal $to:literal),+) => {
@@ -413,17 +443,7 @@ macro_rules! drive_end {
     () => {
         concat!(
             limit!(0 20 21, 1 22 23),
-            "vmul.f32 s4, s2, s2\n",
-            "vmla.f32 s4, s3, s3\n",
-            "vmov r2, s4\n",
-            "sub r2, r2, #{shortest}\n",
-            "cmp r2, #{between}\n",
-            "bhs 9f\n",
-            "vsqrt.f32 s4, s4\n",
-            "vmov.f32 s5, #1.0\n",
-            "vdiv.f32 s4, s5, s4\n",
-            "vmul.f32 s2, s2, s4\n",
-            "vmul.f32 s3, s3, s4\n",
+            on_circle!(2 3, 4 5, "r2", "9f"),
             "vstmia r1, {{s0-s3}}\n",
             "vpop {{d8-d15}}\n",
             "movs r0, #1\n",
@@ -473,10 +493,8 @@ unsafe extern "C" fn drive_step(
         "add r12, r1, #24",
         "movs r2, #2",
         "2:",
-        sixteen_at!(0 28 29 30 31), sixteen_at!(1 28 29 30 31), fold!(27: 0 1),
-        sixteen_at!(1 28 29 30 31), sixteen_at!(2 28 29 30 31), fold!(27: 1 2), fold!(26: 0 1),
-        sixteen_at!(1 28 29 30 31), sixteen_at!(2 28 29 30 31), fold!(27: 1 2),
-        sixteen_at!(2 28 29 30 31), sixteen_at!(3 28 29 30 31), fold!(27: 2 3), fold!(26: 1 2),
+        sixty_four_at!(0 1 2),
+        sixty_four_at!(1 2 3),
         "vstmia r12!, {{s0-s1}}",
         "subs r2, r2, #1",
         "bne 2b",
@@ -522,40 +540,6 @@ unsafe extern "C" fn drive_held_step(
         shortest = const SHORTEST.to_bits(),
         between = const LONGEST.to_bits() - SHORTEST.to_bits(),
     )
-}
-
-/// [`Sealed::drive`](crate::scalar::sealed::Sealed::drive).
-#[inline(always)]
-pub(crate) fn drive(
-    constants: &Constants,
-    ranges: &[[f32; 2]; 6],
-    coefficients: &[f32; 256],
-    registers: &mut FromFirst<f32>,
-) -> bool {
-    // SAFETY: types say how many ranges, coefficients and constants there are, and that there are more than ten
-    // registers.
-    unsafe {
-        drive_step(
-            coefficients.as_ptr(),
-            registers.as_mut_ptr(),
-            ranges.as_ptr(),
-            constants.as_ptr(),
-        )
-    }
-}
-
-/// [`Sealed::drive_held`](crate::scalar::sealed::Sealed::drive_held).
-#[inline(always)]
-pub(crate) fn drive_held(
-    constants: &Constants,
-    ranges: &[[f32; 2]; 6],
-    present: &mut [f32; 4],
-    held: &[f32; 64],
-) -> bool {
-    // SAFETY: types say how many numbers there are.
-    unsafe {
-        drive_held_step(held.as_ptr(), present.as_mut_ptr(), ranges.as_ptr(), constants.as_ptr())
-    }
 }
 
 /// The pose at r1 (x, y, heading, sine, cosine) moves on by the outputs in registers 0 to 2; r3 is where the
@@ -699,35 +683,6 @@ pose!(
     "vldmia r0, {{s0-s2}}"
 );
 
-/// [`Sealed::planar`](crate::scalar::sealed::Sealed::planar).
-#[inline(always)]
-pub(crate) fn planar(
-    constants: &Constants,
-    ranges: &[[f32; 2]; 2],
-    coefficients: &[f32; 48],
-    registers: &mut FromFirst<f32>,
-) -> bool {
-    // SAFETY: types say how many ranges, coefficients and constants there are, and that there are more than
-    // seven registers.
-    unsafe {
-        planar_step(
-            coefficients.as_ptr(),
-            registers.as_mut_ptr(),
-            ranges.as_ptr(),
-            constants.as_ptr(),
-        )
-    }
-}
-
-/// [`Sealed::planar_held`](crate::scalar::sealed::Sealed::planar_held).
-#[inline(always)]
-pub(crate) fn planar_held(constants: &Constants, pose: &mut [f32; 5], outputs: &[f32; 3]) -> bool {
-    let [_, _, limits @ ..] = constants;
-    let limits = limits.as_ptr();
-    // SAFETY: types say how many outputs and limits there are, and what a pose is; ranges are not read.
-    unsafe { planar_held_step(outputs.as_ptr(), pose.as_mut_ptr(), limits, limits) }
-}
-
 /// Of each shape of a [`Run`].
 static KERNELS: [unsafe extern "C" fn(*const f32, *mut f32, usize, *const f32); 12] =
     [two_1, two_2, two_3, two_4, two_5, two_6, three_1, three_2, four_1, four_2, five_1, six_1];
@@ -745,4 +700,109 @@ pub(crate) fn fold(run: Run, from: &[f32], to: &mut [f32], v: &[f32]) -> bool {
     // is borrowed to be written overlaps nothing.
     unsafe { kernel(from.as_ptr(), to.as_mut_ptr(), tiles, v.as_ptr()) };
     true
+}
+
+impl Sealed for f32 {
+    #[inline(always)]
+    fn terms(
+        registers: &[Cell<f32>; REGISTERS],
+        products: &[[u8; 2]],
+        made: &[Cell<f32>],
+        coefficients: &[f32],
+        outputs: &mut [f32],
+    ) {
+        let kernel = match outputs.len() {
+            1 => terms_1,
+            2 => terms_2,
+            3 => terms_3,
+            4 => terms_4,
+            _ => return,
+        };
+        let count = products.len();
+        let row = count.wrapping_add(1);
+        let enough = coefficients.len() >= row.wrapping_mul(outputs.len());
+        if count == 0 || made.len() < count || !enough {
+            // The constants alone.
+            for (output, constant) in outputs.iter_mut().zip(coefficients.iter().step_by(row)) {
+                *output = *constant;
+            }
+            return;
+        }
+        // SAFETY: there is as much of everything as is read and written, an index has a byte and finds one of 256
+        // registers, and cells may be written through shared references.
+        unsafe {
+            kernel(
+                registers.as_ptr(),
+                products.as_ptr(),
+                made.as_ptr(),
+                coefficients.as_ptr(),
+                outputs.as_mut_ptr(),
+                count,
+            )
+        };
+    }
+
+    #[inline(always)]
+    fn drive(
+        constants: &Constants,
+        ranges: &[[f32; 2]; 6],
+        coefficients: &[f32; 256],
+        registers: &mut FromFirst<f32>,
+    ) -> bool {
+        // SAFETY: types say how many ranges, coefficients and constants there are, and that there are more than ten
+        // registers.
+        unsafe {
+            drive_step(
+                coefficients.as_ptr(),
+                registers.as_mut_ptr(),
+                ranges.as_ptr(),
+                constants.as_ptr(),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn drive_held(
+        constants: &Constants,
+        ranges: &[[f32; 2]; 6],
+        present: &mut [f32; 4],
+        held: &[f32; 64],
+    ) -> bool {
+        // SAFETY: types say how many numbers there are.
+        unsafe {
+            drive_held_step(
+                held.as_ptr(),
+                present.as_mut_ptr(),
+                ranges.as_ptr(),
+                constants.as_ptr(),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn planar(
+        constants: &Constants,
+        ranges: &[[f32; 2]; 2],
+        coefficients: &[f32; 48],
+        registers: &mut FromFirst<f32>,
+    ) -> bool {
+        // SAFETY: types say how many ranges, coefficients and constants there are, and that there are more than
+        // seven registers.
+        unsafe {
+            planar_step(
+                coefficients.as_ptr(),
+                registers.as_mut_ptr(),
+                ranges.as_ptr(),
+                constants.as_ptr(),
+            )
+        }
+    }
+
+    #[inline(always)]
+    fn planar_held(constants: &Constants, pose: &mut [f32; 5], outputs: &[f32; 3]) -> bool {
+        let [_, _, limits @ ..] = constants;
+        let limits = limits.as_ptr();
+        // SAFETY: types say how many outputs and limits there are, and what a pose is; ranges are not read.
+        unsafe { planar_held_step(outputs.as_ptr(), pose.as_mut_ptr(), limits, limits) }
+    }
 }

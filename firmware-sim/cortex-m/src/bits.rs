@@ -3,22 +3,16 @@
 
 use firmware_core::{Model, Predictor, PredictorState};
 
+#[path = "random.rs"]
+mod random;
+use random::{Random, hash};
+
 /// Steps from one set of random measurements to the next.
 const ROLLOUT: u32 = 8;
 /// Samples of a model's history at most, the present one included.
 const SAMPLES: usize = firmware_core::capacity::MAX_LAG + 1;
 
-/// Numbers by xorshift (Marsaglia 2003), the same everywhere.
-struct Random(u64);
-
 impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0
-    }
-
     /// Within ±`most`; now and then the bound itself, nothing, or a number so small that it is not normal.
     fn number(&mut self, most: f32) -> f32 {
         let bits = self.next();
@@ -32,11 +26,6 @@ impl Random {
             _ => sign * share * most,
         }
     }
-}
-
-/// FNV-1a over the words.
-fn hash(hash: u64, word: u32) -> u64 {
-    (hash ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01B3)
 }
 
 /// Predicts `steps` samples, in rollouts of eight after random measurements, and the same with one input held, with random inputs, some of

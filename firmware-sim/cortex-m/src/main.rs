@@ -24,23 +24,14 @@ use firmware_core::{Model, Predictor, PredictorState};
 mod host;
 mod machine;
 mod models;
+mod owner;
 
 use machine::count;
 use models::MODELS;
+use owner::{KEY, SIGNED};
 
 /// Repetitions that are counted together: a tick is then less than a hundredth of an instruction.
 const REPETITIONS: u32 = 1_000;
-/// A public key, and the signature of 64 zeros by its owner, whose seed is 32 times 1.
-const KEY: [u8; 32] = [
-    138, 136, 227, 221, 116, 9, 241, 149, 253, 82, 219, 45, 60, 186, 93, 114, 202, 103, 9, 191, 29,
-    148, 18, 27, 243, 116, 136, 1, 180, 15, 111, 92,
-];
-const SIGNED: [u8; 64] = [
-    133, 156, 78, 248, 219, 176, 51, 136, 98, 139, 41, 101, 68, 11, 201, 123, 193, 49, 172, 233, 7,
-    234, 110, 7, 145, 108, 149, 106, 115, 211, 75, 213, 234, 144, 164, 175, 219, 174, 249, 249,
-    116, 70, 84, 239, 74, 162, 89, 186, 224, 192, 153, 64, 46, 59, 173, 24, 48, 182, 48, 59, 28,
-    180, 240, 2,
-];
 /// Room for the largest blob that is read from the host.
 const ROOM: usize = 48 * 1024;
 

@@ -4,20 +4,14 @@
 use firmware_core::capacity::{MAX_INPUTS, MAX_STATES};
 use firmware_core::q31::{FixedModel, FixedState};
 
+#[path = "random.rs"]
+mod random;
+use random::{Random, hash};
+
 /// Steps from one set of random measurements to the next.
 const ROLLOUT: u32 = 8;
 
-/// Numbers by xorshift (Marsaglia 2003), the same everywhere.
-struct Random(u64);
-
 impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0
-    }
-
     /// Anywhere, more often near the middle; now and then the last numbers there are, and nothing.
     fn number(&mut self) -> i32 {
         let bits = self.next();
@@ -31,11 +25,6 @@ impl Random {
             _ => number,
         }
     }
-}
-
-/// FNV-1a over the words.
-fn hash(hash: u64, word: u32) -> u64 {
-    (hash ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01B3)
 }
 
 /// Predicts `steps` samples, in rollouts of eight after random measurements, with random inputs; how many did

@@ -22,23 +22,15 @@ mod firmware;
 #[allow(dead_code)]
 #[path = "../machine.rs"]
 mod machine;
+#[path = "../owner.rs"]
+mod owner;
+
+use owner::{KEY, SIGNED};
 
 /// Ticks of a loop.
 const TICKS: u32 = 400;
 /// Room for all that the host says.
 const ROOM: usize = 8 * MAX_FRAME;
-/// A public key, and a signature that is not of what is asked for.
-const KEY: [u8; 32] = [
-    138, 136, 227, 221, 116, 9, 241, 149, 253, 82, 219, 45, 60, 186, 93, 114, 202, 103, 9, 191, 29,
-    148, 18, 27, 243, 116, 136, 1, 180, 15, 111, 92,
-];
-const SIGNED: [u8; 64] = [
-    133, 156, 78, 248, 219, 176, 51, 136, 98, 139, 41, 101, 68, 11, 201, 123, 193, 49, 172, 233, 7,
-    234, 110, 7, 145, 108, 149, 106, 115, 211, 75, 213, 234, 144, 164, 175, 219, 174, 249, 249,
-    116, 70, 84, 239, 74, 162, 89, 186, 224, 192, 153, 64, 46, 59, 173, 24, 48, 182, 48, 59, 28,
-    180, 240, 2,
-];
-
 #[entry]
 fn main() -> ! {
     machine::end(measure().is_some())
