@@ -40,4 +40,8 @@ pub const MAX_HORIZON: u32 = 65_535;
 /// observables, and, of a sparse model, powers, harmonics and terms. They are numbered by a byte.
 pub const REGISTERS: usize = 256;
 
+/// Numbers of a model's samples, the latest inputs among them, that a control loop keeps of each of its
+/// predictions: those of any model with three coordinates and two inputs, and of most others.
+pub const MAX_KEPT: usize = 84;
+
 const _: () = assert!(MAX_FUNCTIONS <= 256 && MAX_SPARSE_TERMS <= 255, "indices are bytes");

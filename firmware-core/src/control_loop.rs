@@ -10,6 +10,7 @@
 //! | [`supervisor`] | the state machine, its alarms, the command watchdog, deadlines |
 //! | [`tracker`] | the model beside the robot: predicted against measured, and the path ahead |
 //! | [`monitor`] | whether what is measured is what the model says, by its own error bounds |
+//! | [`rhythm`] | which ticks are samples, and what is done at those between them |
 //! | [`telemetry`] | frames, and the queue that never blocks a loop |
 //! | [`soft_leg`] | a leg with two valves and two pumps |
 //! | [`rosbot`] | a robot with two driven sides |
@@ -27,12 +28,14 @@
 //! what is the same for every robot is in [`Supervisor`], what is left is who measures and who moves.
 
 pub mod monitor;
+pub mod rhythm;
 pub mod rosbot;
 pub mod soft_leg;
 pub mod supervisor;
 pub mod telemetry;
 pub mod tracker;
 
+pub use rhythm::Rhythm;
 pub use rosbot::Rosbot;
 pub use soft_leg::SoftLeg;
 pub use supervisor::{Alarms, Mode, Supervisor, Timing};
@@ -65,7 +68,8 @@ pub trait ControlLoop<const M: usize> {
     /// once.
     fn finish(&mut self, now_us: u64) -> Mode;
 
-    /// Where the robot will be at the coming samples, shape `[samples, states]` (model's units).
+    /// Where the robot will be at the samples after the last one, shape `[samples, states]` (model's units), as
+    /// far as it has been predicted.
     fn path(&self) -> &[f32];
 
     /// Its state machine.
@@ -127,12 +131,20 @@ pub enum ControlLoopError {
     },
 }
 
+/// `x`, or what is nearest to it from `low` to `high`; `low` for NaN. Methods of f32 that do this are calls on a
+/// Cortex-M4F, or panic for a range that is none.
+#[inline(always)]
+pub(crate) fn limited(x: f32, low: f32, high: f32) -> f32 {
+    let x = if x > low { x } else { low };
+    if x < high { x } else { high }
+}
+
 /// A duty of `share`, 0 to 1, of the most.
 pub(crate) fn set_share(
     pwm: &mut impl embedded_hal::pwm::SetDutyCycle,
     share: f32,
 ) -> Result<(), ActuatorError> {
     // Casts to integers saturate, and NaN gives 0.
-    let duty = (share.clamp(0.0, 1.0) * f32::from(pwm.max_duty_cycle()) + 0.5) as u16;
+    let duty = (limited(share, 0.0, 1.0) * f32::from(pwm.max_duty_cycle()) + 0.5) as u16;
     pwm.set_duty_cycle(duty.min(pwm.max_duty_cycle())).map_err(|_| ActuatorError)
 }

@@ -129,14 +129,20 @@ impl<'a> ErrorBounds<'a> {
     /// horizon and for a coordinate that is not there.
     #[inline]
     pub fn bound(&self, step: u32, coordinate: usize) -> Option<f32> {
-        if coordinate >= self.states {
-            return None;
-        }
-        if step == 0 {
+        if step == 0 && coordinate < self.states {
             return Some(0.0);
         }
+        self.row(step)?.get(coordinate).copied()
+    }
+
+    /// The bounds of all coordinates after so many steps, shape `[states]`; `None` for step 0 and beyond the last
+    /// horizon.
+    #[inline]
+    pub(crate) fn row(&self, step: u32) -> Option<&'a [f32]> {
+        if step == 0 {
+            return None;
+        }
         let horizon = self.horizons.partition_point(|steps| *steps < step);
-        let row = horizon.checked_mul(self.states)?;
-        self.bounds.get(row.checked_add(coordinate)?).copied()
+        self.bounds.get(horizon.checked_mul(self.states)?..)?.get(..self.states)
     }
 }

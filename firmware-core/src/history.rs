@@ -2,22 +2,18 @@
 //! outputs back to coordinates.
 
 use crate::Scalar;
-use crate::capacity::MAX_STATES;
-use crate::model::{Space, Structure, Symmetry, Target};
-use crate::registers::{GROUP, Kind, Layout, Registers};
+use crate::capacity::{MAX_KEPT, MAX_STATES};
+use crate::model::{Space, Structure, Target};
+use crate::registers::{FIRST, GROUP, Kind, Layout, Place, Registers};
 
-/// One sample of the robot.
+/// One sample of the robot: of each coordinate itself, its change since the sample before, its sine and its
+/// cosine, as far as they are needed.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sample<S> {
-    /// Coordinates; of an absolute angle only sine and cosine are kept up.
-    x: [S; MAX_STATES],
-    sin: [S; MAX_STATES],
-    cos: [S; MAX_STATES],
-}
+pub struct Sample<S>(pub(crate) [[S; GROUP]; MAX_STATES]);
 
 impl<S: Scalar> Sample<S> {
-    const ZERO: Self =
-        Self { x: [S::ZERO; MAX_STATES], sin: [S::ZERO; MAX_STATES], cos: [S::ONE; MAX_STATES] };
+    /// Of coordinates that are 0.
+    pub(crate) const ZERO: Self = Self([[S::ZERO, S::ZERO, S::ZERO, S::ONE]; MAX_STATES]);
 }
 
 /// The present sample and what a model looks at of the ones before it.
@@ -46,12 +42,7 @@ impl<S: Scalar> Clone for History<S> {
 
     fn clone_from(&mut self, other: &Self) {
         (self.layout, self.kept, self.filled) = (other.layout, other.kept, other.filled);
-        for (first, count) in other.kept {
-            let from = other.registers.slice(first, count.into());
-            for (to, x) in self.registers.slice_mut(first, count.into()).iter_mut().zip(from) {
-                *to = *x;
-            }
-        }
+        copy(self.kept, self.registers.groups_mut(), other.registers.groups());
     }
 }
 
@@ -64,6 +55,55 @@ impl<S: Scalar> PartialEq for History<S> {
                 let count = usize::from(*count);
                 self.registers.slice(*first, count) == other.registers.slice(*first, count)
             })
+    }
+}
+
+/// What a [`History`] keeps, without room to compute: a fraction of it.
+#[derive(Clone, Debug)]
+pub(crate) struct Saved<S> {
+    numbers: [[S; GROUP]; MAX_KEPT / GROUP],
+    layout: u32,
+    kept: [(u8, u8); 2],
+    filled: u8,
+}
+
+impl<S: Scalar> Saved<S> {
+    pub(crate) const fn empty() -> Self {
+        let numbers = [[S::ZERO; GROUP]; MAX_KEPT / GROUP];
+        Self { numbers, layout: 0, kept: [(0, 0); 2], filled: 0 }
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.filled == 0
+    }
+
+    pub(crate) fn clear(&mut self) {
+        (self.layout, self.filled) = (0, 0);
+    }
+
+    /// Takes what a history keeps, of which there is no more than [`MAX_KEPT`].
+    #[inline(always)]
+    pub(crate) fn save(&mut self, history: &History<S>) {
+        (self.layout, self.kept, self.filled) = (history.layout, history.kept, history.filled);
+        copy(self.kept, &mut self.numbers, history.registers.groups());
+    }
+
+    /// Gives it back.
+    #[inline(always)]
+    pub(crate) fn restore(&self, history: &mut History<S>) {
+        (history.layout, history.kept, history.filled) = (self.layout, self.kept, self.filled);
+        copy(self.kept, history.registers.groups_mut(), &self.numbers);
+    }
+}
+
+/// Copies what is `kept`, and what lies between and just behind it.
+#[inline(always)]
+fn copy<S: Copy>([_, (first, count)]: [(u8, u8); 2], to: &mut [[S; GROUP]], from: &[[S; GROUP]]) {
+    let groups = (usize::from(first) + usize::from(count)).saturating_sub(FIRST.into());
+    let groups = groups.div_ceil(GROUP);
+    for (to, [a, b, c, d]) in to.iter_mut().zip(from).take(groups) {
+        // Element by element: a load and a store on a Cortex-M, which would call a function otherwise.
+        *to = [*a, *b, *c, *d];
     }
 }
 
@@ -116,33 +156,40 @@ impl<S: Scalar> History<S> {
     /// sample it is ignored.
     #[inline]
     pub fn push(&mut self, structure: &Structure<'_>, input: &[S], next: &Sample<S>) {
+        self.take(structure, input, &mut next.clone());
+    }
+
+    /// [`push`](Self::push) of a sample whose changes are worked out where it lies.
+    #[inline]
+    pub(crate) fn take(&mut self, structure: &Structure<'_>, input: &[S], next: &mut Sample<S>) {
         let layout = structure.layout();
         if self.layout != layout.id {
-            *self = Self { layout: layout.id, kept: layout.kept(), ..Self::default() };
+            (self.layout, self.kept, self.filled) = (layout.id, layout.kept(), 0);
+            for (first, count) in self.kept {
+                self.registers.slice_mut(first, count.into()).fill(S::ZERO);
+            }
         }
-        let increment = match layout.increments && self.filled > 0 {
-            true => self.increment(structure, next),
-            false => [S::ZERO; MAX_STATES],
-        };
+        if layout.increments && self.filled > 0 {
+            self.change(structure, next);
+        } else {
+            next.0
+                .iter_mut()
+                .take(layout.states.len())
+                .for_each(|[_, change, ..]| *change = S::ZERO);
+        }
         let inputs = self.registers.slice_mut(layout.first_input, layout.inputs());
         for (i, to) in inputs.iter_mut().enumerate() {
             *to = at(input, i as u8);
         }
-        let mut staged = [[S::ZERO; GROUP]; MAX_STATES];
-        let parts = next.x.iter().zip(increment).zip(&next.sin).zip(&next.cos);
-        for (to, (((x, increment), sin), cos)) in staged.iter_mut().zip(parts) {
-            *to = [*x, increment, *sin, *cos];
-        }
-        self.registers.advance(layout, &staged);
+        self.registers.advance(layout, &next.0);
         // Only what a later step may look at is counted.
         let room = u8::try_from(structure.lag()).unwrap_or(u8::MAX).saturating_add(1);
         self.filled = self.filled.saturating_add(1).min(room);
     }
 
-    /// Coordinate `i` of the present sample.
+    /// A coordinate of the present sample.
     #[inline]
-    fn coordinate(&self, layout: &Layout, i: u8) -> S {
-        let place = layout.place(i);
+    fn coordinate(&self, place: Place) -> S {
         if place.kind.absolute_angle() {
             self.registers.get(place.sin).atan2(self.registers.get(place.cos))
         } else {
@@ -154,8 +201,8 @@ impl<S: Scalar> History<S> {
     /// predicts them absolutely, as they came or wrapped after a step otherwise.
     #[inline]
     pub fn coordinates(&self, structure: &Structure<'_>, out: &mut [S]) {
-        for (i, to) in (0..).zip(out.iter_mut().take(structure.states().len())) {
-            *to = self.coordinate(structure.layout(), i);
+        for (to, place) in out.iter_mut().zip(&structure.layout().states) {
+            *to = self.coordinate(*place);
         }
     }
 
@@ -191,25 +238,23 @@ impl<S: Scalar> History<S> {
     /// of the regression, shape `[outputs]`. The inverse of [`retract`](Self::retract).
     #[inline]
     pub fn targets(&self, structure: &Structure<'_>, next: &Sample<S>, out: &mut [S]) {
-        let increments = structure.states().iter().any(|s| s.target == Target::Increment);
-        let increment = match increments {
-            true => self.increment(structure, next),
-            false => [S::ZERO; MAX_STATES],
-        };
+        let mut next = *next;
+        if structure.states().iter().any(|s| s.target == Target::Increment) {
+            self.change(structure, &mut next);
+        }
         let mut to = out.iter_mut();
-        for (i, state) in structure.states().iter().enumerate() {
+        for (state, [x, change, sin, cos]) in structure.states().iter().zip(next.0) {
             let mut put = |value| {
                 if let Some(to) = to.next() {
                     *to = value;
                 }
             };
-            let i = i as u8;
             match (state.target, state.space) {
-                (Target::Increment, _) => put(at(&increment, i)),
-                (Target::Absolute, Space::Line) => put(at(&next.x, i)),
+                (Target::Increment, _) => put(change),
+                (Target::Absolute, Space::Line) => put(x),
                 (Target::Absolute, Space::Circle) => {
-                    put(at(&next.sin, i));
-                    put(at(&next.cos, i));
+                    put(sin);
+                    put(cos);
                 }
             }
         }
@@ -220,13 +265,8 @@ impl<S: Scalar> History<S> {
     /// not finite, an absolute angle has lost its direction, or a coordinate leaves its limit.
     #[inline]
     pub fn retract(&self, structure: &Structure<'_>, outputs: &[S]) -> Option<Sample<S>> {
-        let mut staged = [[S::ZERO; GROUP]; MAX_STATES];
-        self.stage(structure.layout(), outputs, &mut staged)?;
         let mut next = Sample::ZERO;
-        let parts = next.x.iter_mut().zip(&mut next.sin).zip(&mut next.cos);
-        for (((x, sin), cos), staged) in parts.zip(staged) {
-            [*x, _, *sin, *cos] = staged;
-        }
+        self.stage(structure.layout(), outputs, &mut next)?;
         Some(next)
     }
 
@@ -237,7 +277,7 @@ impl<S: Scalar> History<S> {
         &self,
         layout: &Layout,
         outputs: &[S],
-        next: &mut [[S; GROUP]; MAX_STATES],
+        Sample(next): &mut Sample<S>,
     ) -> Option<()> {
         let registers = &self.registers;
         if let Some(pose) = layout.pose {
@@ -301,39 +341,34 @@ impl<S: Scalar> History<S> {
 
     /// Takes the sample that [`stage`](Self::stage) made.
     #[inline(always)]
-    pub(crate) fn advance(&mut self, layout: &Layout, next: &[[S; GROUP]; MAX_STATES]) {
-        self.registers.advance(layout, next);
+    pub(crate) fn advance(&mut self, layout: &Layout, next: &Sample<S>) {
+        self.registers.advance(layout, &next.0);
     }
 
-    /// The increments of all coordinates from the present sample to another: wrapped on S¹, the pose
+    /// The changes of all coordinates from the present sample to another: wrapped on S¹, the pose
     /// of an se(2)-symmetric model in the frame of the present one.
     #[inline]
-    fn increment(&self, structure: &Structure<'_>, to: &Sample<S>) -> [S; MAX_STATES] {
-        let mut increment = [S::ZERO; MAX_STATES];
+    fn change(&self, structure: &Structure<'_>, Sample(next): &mut Sample<S>) {
         let layout = structure.layout();
-        for (i, (d, place)) in (0..).zip(increment.iter_mut().zip(&layout.states)) {
+        let places = layout.states.iter().zip(structure.states());
+        for ([x, change, sin, cos], (place, state)) in next.iter_mut().zip(places) {
             let to = match place.kind.absolute_angle() {
                 // Two arc tangents for nothing if no one reads the change of an absolute angle.
                 true if !layout.increments => continue,
-                true => at(&to.sin, i).atan2(at(&to.cos, i)),
-                false => at(&to.x, i),
+                true => sin.atan2(*cos),
+                false => *x,
             };
-            let change = to - self.coordinate(layout, i);
-            let circle = structure.states().get(usize::from(i)).map(|s| s.space);
-            *d = if circle == Some(Space::Circle) { change.wrap() } else { change };
+            *change = state.space.difference(to, self.coordinate(*place));
         }
-        if let Symmetry::Se2 { x, y, heading } = structure.symmetry() {
-            let place = layout.place(heading);
-            let (s, c) = (self.registers.get(place.sin), self.registers.get(place.cos));
-            let (dx, dy) = (at(&increment, x), at(&increment, y));
-            if let Some(ahead) = increment.get_mut(usize::from(x)) {
-                *ahead = c * dx + s * dy;
-            }
-            if let Some(left) = increment.get_mut(usize::from(y)) {
-                *left = c * dy - s * dx;
+        let Some(pose) = layout.pose else { return };
+        let (s, c) = (self.registers.get(pose.sin), self.registers.get(pose.cos));
+        let of = |coordinate: u8| next.get(usize::from(coordinate)).map(|[_, change, ..]| *change);
+        let (dx, dy) = (of(pose.x).unwrap_or_default(), of(pose.y).unwrap_or_default());
+        for (coordinate, turned) in [(pose.x, c * dx + s * dy), (pose.y, c * dy - s * dx)] {
+            if let Some([_, change, ..]) = next.get_mut(usize::from(coordinate)) {
+                *change = turned;
             }
         }
-        increment
     }
 }
 
@@ -347,6 +382,11 @@ fn on_circle<S: Scalar>(mut pair: [S; 2]) -> Option<[S; 2]> {
 }
 
 impl Structure<'_> {
+    /// How many numbers of its samples a history of this structure keeps, the latest inputs among them.
+    pub fn kept(&self) -> usize {
+        usize::from(self.layout().end.saturating_sub(FIRST))
+    }
+
     /// A sample from coordinates, shape `[states]`, angles in radians; missing ones are 0.
     #[inline]
     pub fn sample<S: Scalar>(&self, coordinates: &[S]) -> Sample<S> {
@@ -358,8 +398,7 @@ impl Structure<'_> {
     /// [`sample`](Self::sample) over an earlier sample of the same structure.
     #[inline]
     pub fn sample_into<S: Scalar>(&self, coordinates: &[S], sample: &mut Sample<S>) {
-        let parts = sample.x.iter_mut().zip(&mut sample.sin).zip(&mut sample.cos);
-        for (i, (((x, sin), cos), value)) in parts.zip(coordinates).enumerate() {
+        for (i, ([x, _, sin, cos], value)) in sample.0.iter_mut().zip(coordinates).enumerate() {
             *x = *value;
             if self.needs_trigonometry(i) {
                 (*sin, *cos) = value.sin_cos();

@@ -2,10 +2,10 @@
 
 use crate::Scalar;
 use crate::capacity::{MAX_OUTPUTS, MAX_STATES};
-use crate::history::History;
+use crate::history::{History, Sample, Saved};
 use crate::kernel::{self, Constants, Direct, Known};
 use crate::model::Model;
-use crate::registers::{FIRST, GROUP, Layout, Registers};
+use crate::registers::{FIRST, Layout, Registers};
 
 /// The first time a rollout left the range that the model was trained in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -63,7 +63,7 @@ pub struct PredictorState<S = f32> {
     out_of_range: Option<OutOfRange>,
     /// What the last step made on the way: the operator's outputs, and the next sample.
     outputs: [S; MAX_OUTPUTS],
-    next: [[S; GROUP]; MAX_STATES],
+    next: Sample<S>,
 }
 
 /// What a step has made on the way is not copied into a state that is there already.
@@ -93,7 +93,7 @@ impl<S: Scalar> Default for PredictorState<S> {
             step: 0,
             out_of_range: None,
             outputs: [S::ZERO; MAX_OUTPUTS],
-            next: [[S::ZERO; GROUP]; MAX_STATES],
+            next: Sample::ZERO,
         }
     }
 }
@@ -123,6 +123,42 @@ impl<S: Scalar> PredictorState<S> {
     /// The samples.
     pub fn history(&self) -> &History<S> {
         &self.history
+    }
+}
+
+/// What a [`PredictorState`] keeps from one step to the next, without room to compute: a control loop that follows
+/// several predictions of a model makes all of them in one state, and saves the others.
+#[derive(Clone, Debug)]
+pub(crate) struct SavedState<S = f32> {
+    history: Saved<S>,
+    step: u32,
+    out_of_range: Option<OutOfRange>,
+}
+
+impl<S: Scalar> SavedState<S> {
+    pub(crate) const fn empty() -> Self {
+        Self { history: Saved::empty(), step: 0, out_of_range: None }
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.history.is_empty()
+    }
+
+    pub(crate) fn clear(&mut self) {
+        self.history.clear();
+        (self.step, self.out_of_range) = (0, None);
+    }
+
+    #[inline(never)]
+    pub(crate) fn save(&mut self, state: &PredictorState<S>) {
+        self.history.save(&state.history);
+        (self.step, self.out_of_range) = (state.step, state.out_of_range);
+    }
+
+    #[inline(never)]
+    pub(crate) fn restore(&self, state: &mut PredictorState<S>) {
+        self.history.restore(&mut state.history);
+        (state.step, state.out_of_range) = (self.step, self.out_of_range);
     }
 }
 
@@ -200,8 +236,8 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         if let Some(coordinate) = coordinates.iter().position(|x| !x.is_finite()) {
             return Err(PredictError::NotFinite { coordinate });
         }
-        let sample = structure.sample(coordinates);
-        state.history.push(structure, applied, &sample);
+        structure.sample_into(coordinates, &mut state.next);
+        state.history.take(structure, applied, &mut state.next);
         state.step = 0;
         state.out_of_range = None;
         Ok(())

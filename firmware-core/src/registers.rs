@@ -23,7 +23,7 @@ use core::cell::Cell;
 use heapless::Vec;
 
 use crate::Scalar;
-use crate::capacity::{MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_STATES, REGISTERS};
+use crate::capacity::{MAX_INPUTS, MAX_KEPT, MAX_LAG, MAX_OBSERVABLES, MAX_STATES, REGISTERS};
 use crate::dictionary::{Observable, Source};
 use crate::model::{Space, State, Symmetry, Target};
 
@@ -86,6 +86,19 @@ impl<S: Scalar> Registers<S> {
     pub(crate) fn all_mut(&mut self) -> &mut FromFirst<S> {
         let [_, _, rest @ ..] = &mut self.0;
         rest
+    }
+
+    /// The same, four at a time.
+    #[inline(always)]
+    pub(crate) fn groups(&self) -> &[[S; GROUP]] {
+        let [_, _, rest @ ..] = &self.0;
+        rest.as_chunks().0
+    }
+
+    /// The same, to be written.
+    #[inline(always)]
+    pub(crate) fn groups_mut(&mut self) -> &mut [[S; GROUP]] {
+        self.all_mut().as_chunks_mut().0
     }
 
     /// The registers before one, and from it on.
@@ -249,13 +262,16 @@ pub(crate) struct Layout {
     pub(crate) id: u32,
 }
 
-/// Registers that a history needs at most: of an angle its sine, cosine and changes are delayed.
-const HISTORY: usize = FIRST as usize
-    + MAX_INPUTS
-    + MAX_STATES * (GROUP + 2 * MAX_LAG + MAX_LAG - 1)
-    + MAX_INPUTS * MAX_LAG
-    + GROUP;
-const _: () = assert!(HISTORY < REGISTERS, "no index of a register that keeps something overflows");
+/// Registers that a history keeps at most: of an angle its sine, cosine and changes are delayed.
+const fn most_kept(states: usize, inputs: usize) -> usize {
+    states * (GROUP + 2 * MAX_LAG + MAX_LAG - 1) + inputs * MAX_LAG + GROUP
+}
+const _: () = assert!(
+    FIRST as usize + MAX_INPUTS + most_kept(MAX_STATES, MAX_INPUTS) < REGISTERS,
+    "no index of a register that keeps something overflows"
+);
+const _: () =
+    assert!(2 + most_kept(3, 2) <= MAX_KEPT, "the loops take every model of their robots");
 
 impl Layout {
     /// Of nothing.

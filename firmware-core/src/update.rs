@@ -154,8 +154,8 @@ use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
 use crate::capacity::{
-    MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_LAG, MAX_OBSERVABLES, MAX_SPARSE_TERMS, MAX_STATES,
-    MAX_TERMS,
+    MAX_BLOCKS, MAX_FACTORS, MAX_INPUTS, MAX_KEPT, MAX_LAG, MAX_OBSERVABLES, MAX_SPARSE_TERMS,
+    MAX_STATES, MAX_TERMS,
 };
 use crate::control_loop::{Alarms, Mode};
 use crate::cost;
@@ -613,6 +613,7 @@ impl Capacities {
                 unlimited(self.instructions),
                 cost::instructions(structure, sparse),
             ),
+            ("numbers of the history", count(MAX_KEPT), count(structure.kept())),
             ("lag", self.lag.into(), count(structure.lag())),
             ("observables", self.observables.into(), count(dictionary.observables().len())),
             ("blocks", self.blocks.into(), count(dictionary.blocks().count())),

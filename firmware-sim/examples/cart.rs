@@ -89,7 +89,7 @@ impl<A: Actuators<1>, S: PositionSensor<1>> ControlLoop<1> for CartLoop<'_, '_, 
         let is_running = self.supervisor.mode() == Mode::Running;
         let mut next = if is_running { self.wanted } else { [0.0] };
         let tracked = self.tracker.sample(&self.applied, measured, &next);
-        self.supervisor.judge(&tracked, &mut self.tracker);
+        self.supervisor.judge(tracked.alarms, &mut self.tracker);
 
         // What is this cart's own: the path ahead under the voltage that the host wants.
         let beyond = |[x]: &[f32; 1]| x.abs() > END_M;
@@ -98,7 +98,7 @@ impl<A: Actuators<1>, S: PositionSensor<1>> ControlLoop<1> for CartLoop<'_, '_, 
             self.held_back += 1;
         }
 
-        let frame = Frame::of(now_us, &self.applied, &tracked, self.tracker.path());
+        let frame = Frame::of(now_us, &self.tracker);
         let mode = self.supervisor.act(&mut self.actuators, next.map(|u| u / SUPPLY_VOLT));
         self.applied = if mode == Mode::Running { next } else { [0.0] };
         self.telemetry.send(self.supervisor.report(frame));

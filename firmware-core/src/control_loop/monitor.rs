@@ -28,6 +28,7 @@
 //! Neither sum grows far beyond its threshold, so that an alarm ends soon after its reason.
 
 use crate::capacity::MAX_STATES;
+use crate::control_loop::limited;
 use crate::error_bounds::ErrorBounds;
 
 /// The most that one sample counts, in bounds.
@@ -101,20 +102,24 @@ impl Monitor {
     /// measurement; beyond the last horizon the bounds of that hold.
     pub fn update(&mut self, bounds: ErrorBounds<'_>, steps: u32, residuals: &[f32]) -> Verdict {
         let last = bounds.horizons().last().copied().unwrap_or(0);
+        let row = bounds.row(steps.min(last)).unwrap_or(&[0.0; MAX_STATES]);
         let mut verdict = Verdict::default();
-        for ((i, residual), sum) in residuals.iter().enumerate().zip(&mut self.far) {
-            let bound = bounds.bound(steps.min(last), i).unwrap_or(0.0);
+        for ((residual, bound), sum) in residuals.iter().zip(row).zip(&mut self.far) {
             // A bound of 0 is one of a state that never erred; NaN counts as infinitely far off.
-            let ratio = residual.abs() / bound.max(f32::MIN_POSITIVE);
+            let bound = if *bound > f32::MIN_POSITIVE { *bound } else { f32::MIN_POSITIVE };
+            let ratio = residual.abs() / bound;
             let ratio = if ratio.is_nan() { f32::INFINITY } else { ratio };
+            let counted = if ratio < CAP { ratio } else { CAP };
             // What has been wrong for long must not take as long to be forgotten.
-            *sum = (*sum + ratio.min(CAP) - 1.0).clamp(0.0, 2.0 * FAR);
-            verdict.ratio = verdict.ratio.max(ratio);
+            *sum = limited(*sum + counted - 1.0, 0.0, 2.0 * FAR);
+            if ratio > verdict.ratio {
+                verdict.ratio = ratio;
+            }
             verdict.alarm |= *sum > FAR;
         }
         let told = if verdict.ratio > 1.0 { self.beyond } else { self.within };
-        // `within` is negative, or 0 with a sum that stays there. (`clamp` would panic where it is not.)
-        self.often = (self.often + told).max(0.0).min(OFTEN - CALM * self.within);
+        // `within` is negative, or 0 with a sum that stays there.
+        self.often = limited(self.often + told, 0.0, OFTEN - CALM * self.within);
         verdict.alarm |= self.often > OFTEN;
         verdict
     }

@@ -3,8 +3,8 @@
 //!
 //! Every tick (10 ms) each side's speed controller reads its encoder and sets its motor. Every
 //! `ticks_per_sample` ticks (100 ms) is a sample of the model, whose inputs are the mean commanded wheel
-//! speeds since the sample before: the pose is predicted from them, corrected where it is measured, and
-//! predicted over the horizon.
+//! speeds since the sample before: the pose is predicted from them, and corrected where it is measured. At the
+//! ticks that follow it is predicted over the horizon, a few steps at each.
 //!
 //! Speed controller, per side (as in the robot's own firmware, a PI):
 //!
@@ -17,11 +17,12 @@
 use embedded_hal::digital::OutputPin;
 use embedded_hal::pwm::SetDutyCycle;
 
+use crate::control_loop::rhythm::Rhythm;
 use crate::control_loop::supervisor::{Alarms, Mode, Supervisor, Timing};
-use crate::control_loop::telemetry::{Frame, Telemetry};
+use crate::control_loop::telemetry::Telemetry;
 use crate::control_loop::tracker::Tracker;
 use crate::control_loop::{
-    ActuatorError, Actuators, Command, ControlLoop, ControlLoopError, set_share,
+    ActuatorError, Actuators, Command, ControlLoop, ControlLoopError, limited, set_share,
 };
 use crate::device::{EncoderCount, PositionSensor};
 use crate::model::Model;
@@ -101,7 +102,7 @@ impl<R: EncoderCount, L: EncoderCount> Encoders for (R, L) {
 /// What fixes the loop of a ROSbot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RosbotSettings {
-    /// Ticks per sample of the model.
+    /// Ticks per sample of the model; from four on the look-ahead is spread over them.
     pub ticks_per_sample: u8,
     /// Encoder counts N per turn of a wheel.
     pub counts_per_turn: f32,
@@ -178,7 +179,7 @@ impl Side {
         let RosbotSettings { supply_volt, proportional_gain, integral_gain, .. } = *settings;
         let error = command - self.speed;
         let wanted = proportional_gain * error + self.integral;
-        let volt = wanted.max(-supply_volt).min(supply_volt);
+        let volt = limited(wanted, -supply_volt, supply_volt);
         let winds_up = volt != wanted && error * wanted > 0.0;
         if !winds_up {
             self.integral += integral_gain * error * period_s;
@@ -203,9 +204,8 @@ pub struct Rosbot<'m, 'a, 'q, A, E, S, const H: usize> {
     telemetry: Telemetry<'q>,
     /// What the host wants (rad/s), right and left.
     wanted: [f32; 2],
-    /// Sum of what was commanded over the ticks since the last sample, and their number.
-    sum: [f32; 2],
-    ticks: u8,
+    /// Of what was commanded.
+    rhythm: Rhythm<2>,
     sides: [Side; 2],
     /// Whether there is a count to compare the next one with.
     counted: bool,
@@ -231,9 +231,7 @@ where
         telemetry: Telemetry<'q>,
     ) -> Result<Self, ControlLoopError> {
         let tracker = Tracker::new(model, settings.blind_samples)?;
-        if settings.ticks_per_sample == 0 {
-            return Err(ControlLoopError::Setting { field: "ticks_per_sample" });
-        }
+        let rhythm = Rhythm::new(settings.ticks_per_sample, H)?;
         for (field, value) in [
             ("counts_per_turn", settings.counts_per_turn),
             ("supply_volt", settings.supply_volt),
@@ -259,8 +257,7 @@ where
             supervisor: Supervisor::new(timing),
             telemetry,
             wanted: [0.0; 2],
-            sum: [0.0; 2],
-            ticks: 0,
+            rhythm,
             sides: [Side::default(); 2],
             counted: false,
             bad_counts: 0,
@@ -309,9 +306,9 @@ where
     }
 
     /// A sample of the model.
-    fn sample(&mut self, now_us: u64) -> Frame {
-        let ticks = f32::from(self.ticks.max(1));
-        let applied = self.sum.map(|sum| sum / ticks);
+    fn sample(&mut self, now_us: u64) {
+        let ticks = self.rhythm.ticks();
+        let applied = self.rhythm.sample(now_us);
         for side in &mut self.sides {
             let deviation = side.deviation / ticks;
             side.mean_deviation += WHEEL_SHARE * (deviation - side.mean_deviation);
@@ -320,12 +317,10 @@ where
                 self.supervisor.raise(Alarms::WHEEL);
             }
         }
-        (self.sum, self.ticks) = ([0.0; 2], 0);
         let measured = self.tracker.measure(&mut self.sensor);
         let held = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
-        let tracked = self.tracker.sample(&applied, measured, &held);
-        self.supervisor.judge(&tracked, &mut self.tracker);
-        Frame::of(now_us, &applied, &tracked, self.tracker.path())
+        let noticed = self.tracker.take(&applied, measured, &held);
+        self.supervisor.judge(noticed, &mut self.tracker);
     }
 
     /// What a robot that stands still does not carry on.
@@ -354,13 +349,16 @@ where
         }
     }
 
-    /// One tick: counts, controls the wheels' speeds, and at a sample measures, predicts and reports.
+    /// One tick: counts, and controls the wheels' speeds; at a sample it measures and predicts, at the ticks
+    /// after it it looks ahead, and reports.
     fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
         self.count();
         // The first tick is a sample, and every `ticks_per_sample`th from there on.
-        let frame = (self.ticks == 0 || self.ticks >= self.settings.ticks_per_sample)
-            .then(|| self.sample(now_us));
+        if self.rhythm.is_sample() {
+            self.sample(now_us);
+        }
+        self.rhythm.go_on(&mut self.tracker, &mut self.supervisor);
 
         let mut shares = [0.0; 2];
         if self.supervisor.mode() == Mode::Running {
@@ -377,14 +375,10 @@ where
         }
         let mode = self.supervisor.act(&mut self.actuators, shares);
         let applied = if mode == Mode::Running { self.wanted } else { [0.0; 2] };
-        for ((sum, side), command) in self.sum.iter_mut().zip(&mut self.sides).zip(applied) {
-            *sum += command;
+        for (side, command) in self.sides.iter_mut().zip(applied) {
             side.deviation += side.speed - command;
         }
-        self.ticks = self.ticks.saturating_add(1);
-        if let Some(frame) = frame {
-            self.telemetry.send(self.supervisor.report(frame));
-        }
+        self.rhythm.end(applied, &self.tracker, &mut self.supervisor, &mut self.telemetry);
         mode
     }
 

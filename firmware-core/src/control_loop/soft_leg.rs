@@ -179,8 +179,8 @@ where
         let measured = self.tracker.measure(&mut self.sensor);
         let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
         let tracked = self.tracker.sample(&self.applied, measured, &next);
-        self.supervisor.judge(&tracked, &mut self.tracker);
-        let frame = Frame::of(now_us, &self.applied, &tracked, self.tracker.path());
+        self.supervisor.judge(tracked.alarms, &mut self.tracker);
+        let frame = Frame::of(now_us, &self.tracker);
         let shares = next.map(|u| u / self.settings.supply_volt);
         let mode = self.supervisor.act(&mut self.actuators, shares);
         self.applied = if mode == Mode::Running { next } else { [0.0; 2] };

@@ -16,8 +16,8 @@ use core::fmt;
 use serde::{Deserialize, Serialize};
 
 use crate::control_loop::telemetry::Frame;
-use crate::control_loop::tracker::{Tracked, Tracker};
-use crate::control_loop::{Actuators, Command, ControlLoopError};
+use crate::control_loop::tracker::Tracker;
+use crate::control_loop::{Actuators, Command, ControlLoopError, limited};
 use crate::model::Model;
 
 /// What the loop is doing.
@@ -354,8 +354,7 @@ impl Supervisor {
             Order::Inputs if inputs.iter().all(|u| u.is_finite()) => {
                 let ranges = model.structure().inputs().iter().map(|input| input.range);
                 for ((to, u), [low, high]) in wanted.iter_mut().zip(inputs).zip(ranges) {
-                    // Written so that no range, however strange, makes it panic.
-                    *to = u.max(low).min(high);
+                    *to = limited(*u, low, high);
                 }
                 self.heard();
             }
@@ -365,17 +364,17 @@ impl Supervisor {
         }
     }
 
-    /// Takes what was noticed at a sample. The model is one of a robot that runs: of one whose actuators
+    /// Takes what a tracker has noticed. The model is one of a robot that runs: of one whose actuators
     /// are off only the sensor is judged.
     pub fn judge<const N: usize, const M: usize, const H: usize>(
         &mut self,
-        tracked: &Tracked<N>,
+        noticed: Alarms,
         tracker: &mut Tracker<'_, '_, N, M, H>,
     ) {
         if self.mode == Mode::Running {
-            self.raise(tracked.alarms);
+            self.raise(noticed);
         } else {
-            self.raise(tracked.alarms & Alarms::AT_REST);
+            self.raise(noticed & Alarms::AT_REST);
             tracker.forget_residuals();
         }
     }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::capacity::{MAX_INPUTS, MAX_STATES};
 use crate::control_loop::supervisor::{Alarms, Mode};
-use crate::control_loop::tracker::Tracked;
+use crate::control_loop::tracker::Tracker;
 use crate::encoding::Writer;
 
 /// One sample.
@@ -71,7 +71,7 @@ fn list<const C: usize>(numbers: &[f32]) -> Vec<f32, C> {
 /// assert_eq!((frame.sequence, frame.dropped), (5, 3));
 /// ```
 pub struct Telemetry<'q> {
-    queue: spsc::Producer<'q, Frame>,
+    queue: Option<spsc::Producer<'q, Frame>>,
     sequence: u32,
     dropped: u32,
 }
@@ -85,7 +85,17 @@ pub type Frames<'q> = spsc::Consumer<'q, Frame>;
 impl<'q> Telemetry<'q> {
     /// The sending end.
     pub fn new(queue: spsc::Producer<'q, Frame>) -> Self {
-        Self { queue, sequence: 0, dropped: 0 }
+        Self { queue: Some(queue), sequence: 0, dropped: 0 }
+    }
+
+    /// Of a robot that nobody listens to: no frame is made.
+    pub fn off() -> Self {
+        Self { queue: None, sequence: 0, dropped: 0 }
+    }
+
+    /// Whether somebody listens.
+    pub fn is_on(&self) -> bool {
+        self.queue.is_some()
     }
 
     /// Numbers a frame, as [`Supervisor::report`](crate::control_loop::Supervisor::report) made it, and
@@ -94,7 +104,8 @@ impl<'q> Telemetry<'q> {
     pub fn send(&mut self, mut frame: Frame) {
         (frame.sequence, frame.dropped) = (self.sequence, self.dropped);
         self.sequence = self.sequence.wrapping_add(1);
-        if self.queue.enqueue(frame).is_err() {
+        let Some(queue) = &mut self.queue else { return };
+        if queue.enqueue(frame).is_err() {
             self.dropped = self.dropped.saturating_add(1);
         }
     }
@@ -106,14 +117,12 @@ impl<'q> Telemetry<'q> {
 }
 
 impl Frame {
-    /// The frame of a sample at `time_us`, to which the inputs `applied` led; `path` is that of the
-    /// tracker.
-    pub fn of<const N: usize, const M: usize>(
+    /// The frame of the last sample of a tracker, which was at `time_us`.
+    pub fn of<const N: usize, const M: usize, const H: usize>(
         time_us: u64,
-        applied: &[f32; M],
-        tracked: &Tracked<N>,
-        path: &[[f32; N]],
+        tracker: &Tracker<'_, '_, N, M, H>,
     ) -> Self {
+        let tracked = tracker.tracked();
         let optional = |x| Option::as_ref(x).map_or(&[][..], <[f32; N]>::as_slice);
         let mut frame = Self {
             time_us,
@@ -122,11 +131,11 @@ impl Frame {
             ..Self::default()
         };
         frame.list(
-            applied,
+            tracker.applied(),
             optional(&tracked.measured),
             optional(&tracked.predicted),
             optional(&tracked.residual),
-            path.last().map_or(&[], |x| x.as_slice()),
+            tracker.path().last().map_or(&[], |x| x.as_slice()),
         );
         frame
     }

@@ -7,12 +7,13 @@
 //! second one begins where all samples that the model looks at are measured: with gaps closer together
 //! than that, only the first one watches.
 
-use crate::capacity::MAX_STATES;
+use crate::capacity::{MAX_KEPT, MAX_STATES};
 use crate::control_loop::ControlLoopError;
 use crate::control_loop::monitor::{GATE, Monitor, Verdict};
 use crate::control_loop::supervisor::Alarms;
 use crate::device::PositionSensor;
 use crate::model::{Model, Space};
+use crate::predictor::SavedState;
 use crate::scalar::Scalar;
 use crate::{PredictError, Predictor, PredictorState};
 
@@ -65,12 +66,21 @@ pub struct Tracked<const N: usize> {
 /// rolled out from the last measurement that was used, with the inputs that were applied. After a gap
 /// that holds once the model looks back at measurements only; until then the predictions in the gap
 /// stand in for them.
+///
+/// Most of the work is the path ahead. A loop with several ticks per sample [takes](Self::take) the sample at its
+/// tick, and [goes on](Self::go_on) at those after it, in its [`Rhythm`](crate::control_loop::Rhythm); a loop that
+/// acts upon the path at once has all of it from [`sample`](Self::sample).
 #[derive(Clone, Debug)]
 pub struct Tracker<'m, 'a, const N: usize, const M: usize, const H: usize> {
     beside: Beside<'m, 'a>,
+    /// The last sample, and what acted before it and is held from it on.
+    seen: Seen,
+    predicted: [f32; N],
+    measured: [f32; N],
+    residual: [f32; N],
+    applied: [f32; M],
+    held: [f32; M],
     path: [[f32; N]; H],
-    /// How much of the path is there.
-    ahead: usize,
 }
 
 impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, M, H> {
@@ -82,14 +92,26 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
     #[inline(always)]
     pub fn new(model: &'m Model<'a>, blind_samples: u32) -> Result<Self, ControlLoopError> {
         let structure = model.structure();
-        for (field, expected, found) in
-            [("states", N, structure.states().len()), ("inputs", M, structure.inputs().len())]
-        {
+        for (field, expected, found) in [
+            ("states", N, structure.states().len()),
+            ("inputs", M, structure.inputs().len()),
+            // Fewer than there is room for are as good.
+            ("numbers of the history", MAX_KEPT, structure.kept().max(MAX_KEPT)),
+        ] {
             if expected != found {
                 return Err(ControlLoopError::DimensionMismatch { field, expected, found });
             }
         }
-        Ok(Self { beside: Beside::new(model, blind_samples), path: [[0.0; N]; H], ahead: 0 })
+        Ok(Self {
+            seen: Seen::default(),
+            predicted: [0.0; N],
+            measured: [0.0; N],
+            residual: [0.0; N],
+            applied: [0.0; M],
+            held: [0.0; M],
+            path: [[0.0; N]; H],
+            beside: Beside::new(model, blind_samples),
+        })
     }
 
     /// The model.
@@ -118,47 +140,92 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
     /// model to predict.
     pub fn sees(&self) -> bool {
         let Beside { blind, unpredicted, unpredicted_limit, .. } = self.beside;
-        blind == 0 && unpredicted <= unpredicted_limit && !self.beside.state.history().is_empty()
+        let is_there = self.seen.used || !self.beside.present.is_empty();
+        blind == 0 && unpredicted <= unpredicted_limit && is_there
     }
 
-    /// Where the robot will be at each of the coming samples with the inputs held; shorter than `H`
-    /// when the prediction diverges on the way, empty while the history fills.
+    /// Where the robot will be at each of the coming samples with the inputs held, as far as it has been
+    /// predicted since the last one; shorter than `H`, too, when the prediction diverges on the way, and
+    /// empty while the history fills.
     pub fn path(&self) -> &[[f32; N]] {
-        self.path.get(..self.ahead).unwrap_or(&[])
+        self.path.get(..self.beside.ahead).unwrap_or(&[])
+    }
+
+    /// The last sample; its alarms include those noticed since.
+    pub fn tracked(&self) -> Tracked<N> {
+        let Seen { predicted, used, compared, steps, bound_steps, ratio, alarms } = self.seen;
+        Tracked {
+            predicted: predicted.then_some(self.predicted),
+            measured: used.then_some(self.measured),
+            residual: compared.then_some(self.residual),
+            steps,
+            bound_steps,
+            ratio,
+            alarms,
+        }
+    }
+
+    /// The mean inputs that acted before it.
+    pub fn applied(&self) -> &[f32; M] {
+        &self.applied
     }
 
     /// Takes a sample: what was `applied` since the one before it, on average, and what is `measured`
-    /// now; then looks ahead with the inputs `held`.
+    /// now. Then looks ahead with the inputs `held`, and compares with the second prediction.
     pub fn sample(
         &mut self,
         applied: &[f32; M],
         measured: Measurement<N>,
         held: &[f32; M],
     ) -> Tracked<N> {
-        let (mut predicted, mut residual) = ([0.0; N], [0.0; N]);
-        let (reading, mut measured) = match measured {
-            Measurement::Taken(coordinates) => (Reading::Taken, coordinates),
-            Measurement::Missing => (Reading::Missing, [0.0; N]),
-            Measurement::Late => (Reading::Late, [0.0; N]),
-            Measurement::Unreadable => (Reading::Unreadable, [0.0; N]),
+        self.take(applied, measured, held);
+        self.go_on(usize::MAX);
+        self.tracked()
+    }
+
+    /// The part of [`sample`](Self::sample) that cannot wait: the robot is predicted, measured, and compared. What
+    /// the sample before has left to do is dropped, but for its measurement. What was noticed.
+    pub fn take(
+        &mut self,
+        applied: &[f32; M],
+        measured: Measurement<N>,
+        held: &[f32; M],
+    ) -> Alarms {
+        if !self.is_done() {
+            self.beside.drop_rest(&self.applied, self.seen.used.then_some(&self.measured));
+        }
+        (self.applied, self.held) = (*applied, *held);
+        let reading = match measured {
+            Measurement::Taken(coordinates) => {
+                self.measured = coordinates;
+                Reading::Taken
+            }
+            Measurement::Missing => Reading::Missing,
+            Measurement::Late => Reading::Late,
+            Measurement::Unreadable => Reading::Unreadable,
         };
         let rows = Rows {
-            predicted: &mut predicted,
-            measured: &mut measured,
-            residual: &mut residual,
-            path: self.path.as_flattened_mut(),
+            predicted: &mut self.predicted,
+            measured: &mut self.measured,
+            residual: &mut self.residual,
         };
-        let seen = self.beside.sample(applied, reading, held, rows);
-        self.ahead = seen.ahead;
-        Tracked {
-            predicted: seen.predicted.then_some(predicted),
-            measured: seen.used.then_some(measured),
-            residual: seen.compared.then_some(residual),
-            steps: seen.steps,
-            bound_steps: seen.bound_steps,
-            ratio: seen.ratio,
-            alarms: seen.alarms,
-        }
+        self.seen = self.beside.take(applied, reading, rows);
+        self.seen.alarms
+    }
+
+    /// So many `steps` of what the last sample has left to do: that it becomes part of the history, its path, and,
+    /// in a call of its own unless there is no limit, the second prediction. What was noticed.
+    pub fn go_on(&mut self, steps: usize) -> Alarms {
+        let used = self.seen.used.then_some(self.measured.as_slice());
+        let path = self.path.as_flattened_mut();
+        let alarms = self.beside.go_on(steps, &self.applied, &self.held, used, path);
+        self.seen.alarms |= alarms;
+        alarms
+    }
+
+    /// Whether the last sample has left nothing to do.
+    pub fn is_done(&self) -> bool {
+        self.beside.due == Due::Nothing
     }
 
     /// Forgets the residuals that have added up, not the history.
@@ -176,39 +243,52 @@ enum Reading {
     Unreadable,
 }
 
-/// Where the numbers of a sample are, shape `[states]`, and its path, shape `[samples, states]`.
+/// Where the numbers of a sample are, shape `[states]`.
 struct Rows<'r> {
     predicted: &'r mut [f32],
     measured: &'r mut [f32],
     residual: &'r mut [f32],
-    path: &'r mut [f32],
 }
 
 /// Which of them there are, and the rest of a [`Tracked`].
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Seen {
     predicted: bool,
     used: bool,
     compared: bool,
-    ahead: usize,
     steps: u32,
     bound_steps: u32,
     ratio: f32,
     alarms: Alarms,
 }
 
+/// What a sample leaves to do, in this order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Due {
+    History,
+    Path,
+    Shadow,
+    Nothing,
+}
+
 /// A tracker of any number of coordinates and inputs: a controller has it once, whatever loops it runs.
 #[derive(Clone, Debug)]
 struct Beside<'m, 'a> {
     predictor: Predictor<'m, 'a>,
+    /// Where every prediction is made: the robot at the last sample, once that has left nothing to do.
     state: PredictorState,
-    /// Where the next samples are predicted; nothing in it is kept.
-    trial: PredictorState,
+    /// The robot at the last sample.
+    present: SavedState,
     monitor: Monitor,
     /// A prediction without corrections, its monitor, and its length.
-    shadow: PredictorState,
+    shadow: SavedState,
     slow: Monitor,
     shadow_steps: u32,
+    /// What comes next, and rows of the path that are there.
+    due: Due,
+    ahead: usize,
+    /// The last sample does not go on where the one before it was.
+    begins_anew: bool,
     /// Samples without a measurement that was used, and the most of them that are allowed.
     blind: u32,
     blind_limit: u32,
@@ -237,6 +317,9 @@ impl<'m, 'a> Beside<'m, 'a> {
             monitor,
             slow: monitor,
             shadow_steps,
+            due: Due::Nothing,
+            ahead: 0,
+            begins_anew: false,
             blind: 0,
             blind_limit,
             unpredicted: 0,
@@ -246,10 +329,10 @@ impl<'m, 'a> Beside<'m, 'a> {
             looks_at: u32::MAX >> (31 - lag.min(31)),
             bad: 0,
             outliers: 0,
-            // Last: what is a kilobyte each is then made in its place.
+            // Last: what is large is then made in its place.
+            present: SavedState::empty(),
+            shadow: SavedState::empty(),
             state: PredictorState::new(),
-            trial: PredictorState::new(),
-            shadow: PredictorState::new(),
         }
     }
 
@@ -257,30 +340,34 @@ impl<'m, 'a> Beside<'m, 'a> {
         self.predictor.model()
     }
 
-    /// [`Tracker::sample`]. A measurement that is taken is turned into (−π, π] where it lies.
     #[inline(never)]
-    fn sample(&mut self, applied: &[f32], reading: Reading, held: &[f32], rows: Rows<'_>) -> Seen {
-        let Rows { predicted, measured, residual, path } = rows;
+    fn step(&mut self, input: &[f32]) -> Result<(), PredictError> {
+        self.predictor.step(&mut self.state, input)
+    }
+
+    /// [`Tracker::take`]. A measurement that is taken is turned into (−π, π] where it lies.
+    #[inline(never)]
+    fn take(&mut self, applied: &[f32], reading: Reading, rows: Rows<'_>) -> Seen {
+        let Rows { predicted, measured, residual } = rows;
         let mut alarms = Alarms::none();
-        self.trial.clone_from(&self.state);
         let mut is_predicted = false;
-        match self.predictor.step(&mut self.trial, applied) {
+        match self.step(applied) {
             Ok(()) => {
-                self.coordinates(&self.trial, predicted);
+                self.coordinates(predicted);
                 is_predicted = true;
             }
             Err(PredictError::NotReady { .. }) => {}
             // Inputs are finite and of the right number: what is left is divergence.
             Err(_) => alarms |= Alarms::DIVERGED,
         }
-        if self.trial.out_of_range().is_some() {
+        if self.state.out_of_range().is_some() {
             alarms |= Alarms::OUT_OF_RANGE;
         }
         self.unpredicted = if is_predicted { 0 } else { self.unpredicted.saturating_add(1) };
         if self.unpredicted > self.unpredicted_limit {
             alarms |= Alarms::SENSOR_LOST;
         }
-        let steps = if is_predicted { self.trial.step() } else { 0 };
+        let steps = if is_predicted { self.state.step() } else { 0 };
         let guesses = (self.guessed & self.looks_at).count_ones();
         let bound_steps = if is_predicted { steps.max(1 + guesses) } else { 0 };
 
@@ -319,20 +406,17 @@ impl<'m, 'a> Beside<'m, 'a> {
             self.outliers = if believed { 0 } else { self.outliers + 1 };
         }
         let is_used = is_taken && believed;
-        if self.beside(applied, is_used.then_some(&*measured)) {
-            alarms |= Alarms::RESIDUAL;
-        }
         self.guessed = (self.guessed << 1) | u32::from(!is_used);
         if is_used {
-            if verdict.ratio > GATE {
-                // The robot really is elsewhere: its history belongs to the place before.
-                self.state.clear();
+            // A robot that really is elsewhere: its history belongs to the place before.
+            self.begins_anew = verdict.ratio > GATE;
+            if self.begins_anew {
                 self.guessed = 0;
             }
-            // Finite, and of the right length: it cannot be refused.
-            let _ = self.predictor.observe(&mut self.state, applied, measured);
             self.blind = 0;
         } else {
+            // A gap in a history that was not full, or no prediction.
+            self.begins_anew = !is_predicted;
             if is_taken {
                 alarms |= Alarms::OUTLIER;
             }
@@ -340,41 +424,12 @@ impl<'m, 'a> Beside<'m, 'a> {
             if self.blind > self.blind_limit {
                 alarms |= Alarms::SENSOR_LOST;
             }
-            // A gap in a history that was not full, or no prediction: begin anew.
-            if is_predicted {
-                self.state.clone_from(&self.trial);
-            } else {
-                self.state.clear();
-            }
         }
-
-        if self.shadow.step() >= self.shadow_steps || self.shadow.history().is_empty() {
-            // It starts from measurements alone: what it is compared with are the bounds of those.
-            match self.guessed & self.looks_at {
-                0 => self.shadow.clone_from(&self.state),
-                _ => self.shadow.clear(),
-            }
-        }
-
-        self.trial.clone_from(&self.state);
-        let mut ahead = 0;
-        for place in path.chunks_exact_mut(predicted.len().max(1)) {
-            match self.predictor.step(&mut self.trial, held) {
-                Ok(()) => {}
-                Err(PredictError::NotReady { .. }) => break,
-                Err(_) => {
-                    alarms |= Alarms::DIVERGED;
-                    break;
-                }
-            }
-            self.coordinates(&self.trial, place);
-            ahead += 1;
-        }
+        (self.due, self.ahead) = (Due::History, 0);
         Seen {
             predicted: is_predicted,
             used: is_used,
             compared: is_compared,
-            ahead,
             steps,
             bound_steps,
             ratio: verdict.ratio,
@@ -382,24 +437,111 @@ impl<'m, 'a> Beside<'m, 'a> {
         }
     }
 
+    /// Makes a sample part of the history, measured or else as it was predicted.
+    fn settle(&mut self, applied: &[f32], used: Option<&[f32]>) {
+        if self.begins_anew {
+            self.state.clear();
+        } else if used.is_some() {
+            self.present.restore(&mut self.state);
+        }
+        if let Some(measured) = used {
+            // Finite, and of the right length: it cannot be refused.
+            let _ = self.predictor.observe(&mut self.state, applied, measured);
+        }
+        self.present.save(&self.state);
+    }
+
+    /// The next sample comes before all is done.
+    #[cold]
+    #[inline(never)]
+    fn drop_rest(&mut self, applied: &[f32], used: Option<&[f32]>) {
+        match self.due {
+            Due::History => self.settle(applied, used),
+            _ => self.present.restore(&mut self.state),
+        }
+        self.shadow.clear();
+    }
+
+    /// [`Tracker::go_on`].
+    #[inline(never)]
+    fn go_on(
+        &mut self,
+        steps: usize,
+        applied: &[f32],
+        held: &[f32],
+        used: Option<&[f32]>,
+        path: &mut [f32],
+    ) -> Alarms {
+        let mut alarms = Alarms::none();
+        let states = self.model().structure().states().len();
+        let mut left = steps;
+        while left > 0 {
+            match self.due {
+                Due::History => {
+                    self.settle(applied, used);
+                    self.due = Due::Path;
+                    left -= 1;
+                }
+                Due::Path => {
+                    let start = self.ahead.saturating_mul(states);
+                    let place = path.get_mut(start..).and_then(|rest| rest.get_mut(..states));
+                    match place.map(|place| (self.step(held), place)) {
+                        Some((Ok(()), place)) => {
+                            self.coordinates(place);
+                            self.ahead += 1;
+                            left -= 1;
+                        }
+                        Some((Err(error), _)) => {
+                            self.due = Due::Shadow;
+                            if !matches!(error, PredictError::NotReady { .. }) {
+                                alarms |= Alarms::DIVERGED;
+                            }
+                        }
+                        None => self.due = Due::Shadow,
+                    }
+                }
+                // It takes more than a step.
+                Due::Shadow if left < steps && steps < usize::MAX => break,
+                Due::Shadow => {
+                    self.due = Due::Nothing;
+                    if self.follow(applied, used) {
+                        alarms |= Alarms::RESIDUAL;
+                    }
+                }
+                Due::Nothing => break,
+            }
+        }
+        alarms
+    }
+
     /// Moves the second prediction on; at its end, whether it has been too far off too often.
-    fn beside(&mut self, applied: &[f32], used: Option<&[f32]>) -> bool {
-        if self.predictor.step(&mut self.shadow, applied).is_err() {
-            // Its history is not full, or it diverged, which the first prediction does not miss.
-            self.shadow.clear();
-            return false;
+    fn follow(&mut self, applied: &[f32], used: Option<&[f32]>) -> bool {
+        self.shadow.restore(&mut self.state);
+        let mut alarm = false;
+        let mut is_over = true;
+        // An error: its history is not full, or it diverged, which the first prediction does not miss.
+        if self.step(applied).is_ok() {
+            is_over = self.state.step() >= self.shadow_steps;
+            if !is_over {
+                self.shadow.save(&self.state);
+            } else if let (Some(x), Some(bounds)) = (used, self.model().error_bounds()) {
+                let (mut expected, mut residual) = ([0.0; MAX_STATES], [0.0; MAX_STATES]);
+                // No model has more states.
+                let expected = expected.get_mut(..x.len()).unwrap_or_default();
+                let residual = residual.get_mut(..x.len()).unwrap_or_default();
+                self.coordinates(expected);
+                self.compare(x, expected, residual);
+                alarm = self.slow.update(bounds, self.state.step(), residual).alarm;
+            }
         }
-        if self.shadow.step() < self.shadow_steps {
-            return false;
+        self.present.restore(&mut self.state);
+        // It starts from measurements alone: what it is compared with are the bounds of those.
+        match self.guessed & self.looks_at {
+            _ if !is_over => {}
+            0 => self.shadow.save(&self.state),
+            _ => self.shadow.clear(),
         }
-        let (Some(x), Some(bounds)) = (used, self.model().error_bounds()) else { return false };
-        let (mut expected, mut residual) = ([0.0; MAX_STATES], [0.0; MAX_STATES]);
-        // No model has more states.
-        let expected = expected.get_mut(..x.len()).unwrap_or_default();
-        let residual = residual.get_mut(..x.len()).unwrap_or_default();
-        self.coordinates(&self.shadow, expected);
-        self.compare(x, expected, residual);
-        self.slow.update(bounds, self.shadow.step(), residual).alarm
+        alarm
     }
 
     fn forget_residuals(&mut self) {
@@ -409,9 +551,9 @@ impl<'m, 'a> Beside<'m, 'a> {
     }
 
     #[inline(never)]
-    fn coordinates(&self, state: &PredictorState, out: &mut [f32]) {
+    fn coordinates(&self, out: &mut [f32]) {
         // Of the right length: it cannot be refused.
-        let _ = self.predictor.coordinates(state, out);
+        let _ = self.predictor.coordinates(&self.state, out);
     }
 
     /// Coordinates with angles in (−π, π]: sensors count turns, and the trainer wraps the angles of a

@@ -63,10 +63,21 @@ impl EncoderCount for Nowhere {
     }
 }
 
-impl<const N: usize> PositionSensor<N> for Nowhere {
+/// A sensor whose last coordinate goes on by as much at every measurement.
+struct Turning {
+    last: f32,
+    by: f32,
+}
+
+impl<const N: usize> PositionSensor<N> for Turning {
     type Error = ();
     fn measure(&mut self) -> Result<Option<[f32; N]>, ()> {
-        black_box(Ok(Some([0.0; N])))
+        self.last += self.by;
+        let mut coordinates = [0.0; N];
+        if let [.., last] = &mut coordinates[..] {
+            *last = self.last;
+        }
+        black_box(Ok(Some(coordinates)))
     }
 }
 
@@ -177,7 +188,8 @@ pub fn rosbot_loop<'m, 'q>(
     telemetry: Telemetry<'q>,
 ) -> Option<impl ControlLoop<2> + use<'m, 'q>> {
     let sides = Sides { right: Motor::new(Nowhere, Nowhere), left: Motor::new(Nowhere, Nowhere) };
-    let devices = (sides, (Nowhere, Nowhere), Nowhere);
+    // A heading that is measured over any number of turns.
+    let devices = (sides, (Nowhere, Nowhere), Turning { last: 0.0, by: 0.45 });
     // What the devices read stands still: no reason to stop.
     let settings = RosbotSettings { stall_volt: 100.0, ..RosbotSettings::default() };
     Rosbot::<_, _, _, 10>::new(model, devices, settings, telemetry).ok()
@@ -200,7 +212,8 @@ pub fn leg_loop<'m, 'q>(
         exhaust_pump: Nowhere,
     };
     let settings = SoftLegSettings::default();
-    SoftLeg::<_, _, 20>::new(model, pneumatics, Nowhere, settings, telemetry).ok()
+    let tip = Turning { last: 0.0, by: 0.0 };
+    SoftLeg::<_, _, 20>::new(model, pneumatics, tip, settings, telemetry).ok()
 }
 
 /// The ROSbot as long as it `goes_on`, asked at every tick.
