@@ -98,10 +98,9 @@ impl<A: Actuators<1>, S: PositionSensor<1>> ControlLoop<1> for CartLoop<'_, '_, 
             self.held_back += 1;
         }
 
-        let frame = Frame::of(now_us, &self.tracker);
         let mode = self.supervisor.act(&mut self.actuators, next.map(|u| u / SUPPLY_VOLT));
         self.applied = if mode == Mode::Running { next } else { [0.0] };
-        self.telemetry.send(self.supervisor.report(frame));
+        self.telemetry.send(Frame::of(now_us, self.supervisor.report(), &self.tracker));
         mode
     }
 

@@ -41,6 +41,7 @@ use crate::mcu::misuse::Misuse;
 use crate::mcu::uart::{self, UartEnd, UartSettings};
 use crate::mcu::{BrownOutDetector, VirtualClock, Wire};
 use embedded_io::Write as _;
+use firmware_core::control_loop::rhythm::most_steps;
 use firmware_core::control_loop::telemetry::{Frame, Telemetry};
 use firmware_core::control_loop::{ControlLoop as _, ControlLoopError, Mode};
 use firmware_core::link::Port;
@@ -142,14 +143,22 @@ impl Robot {
         }
     }
 
-    /// Instructions of a tick of its loop with this model: one that is a sample, with its two predictions
-    /// for now and those ahead, and one that is none.
+    /// Steps of the model that a tick of its loop makes at most.
+    pub fn steps(self) -> u64 {
+        let steps = match self {
+            Self::Rosbot => most_steps(RosbotBench::TICKS_PER_SAMPLE as u8, RosbotBench::AHEAD),
+            Self::SoftLeg => most_steps(SoftLegBench::TICKS_PER_SAMPLE as u8, SoftLegBench::AHEAD),
+        };
+        steps as u64
+    }
+
+    /// Instructions of a tick of its loop with this model: one that predicts, and one that does not.
     ///
     /// The model's instructions are those of the [cost table](firmware_core::cost).
     pub fn instructions(self, model: &Model<'_>, controller: &Controller) -> [u64; 2] {
         let step = u64::from(cost::instructions(model.structure(), model.terms()));
         let rest = u64::from(controller.tick_instructions);
-        [rest + (2 + u64::from(self.ahead())) * step, rest]
+        [rest + self.steps() * step, rest]
     }
 }
 
@@ -438,7 +447,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             states: N,
             tick_us: R::TICK_US,
             sample_us: R::TICK_US * R::TICKS_PER_SAMPLE,
-            steps: 2 + R::AHEAD as u64,
+            steps: robot.steps(),
         };
         store.installed(of, Speed { clock: clock.clone(), controller }, rig.board(), seed)
     });
@@ -501,16 +510,19 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             began_us += waited_us;
             let is_sample = of_boot % R::TICKS_PER_SAMPLE == 0;
             // While the model's history fills there is nothing to predict.
-            let predicts = is_sample && of_boot / R::TICKS_PER_SAMPLE >= lag;
+            let predicts = of_boot / R::TICKS_PER_SAMPLE >= lag;
             of_boot += 1;
             let truth = world.rig.truth();
             firmware.tick(began_us);
             if is_sample {
-                let path = firmware.path().to_vec();
                 if world.pending.len() == MOST_PENDING {
                     world.pending.pop_front();
                 }
-                world.pending.push_back(Then { time_us: began_us, truth, path });
+                world.pending.push_back(Then { time_us: began_us, truth, path: Vec::new() });
+            }
+            // It grows from tick to tick.
+            if let Some(then) = world.pending.back_mut() {
+                then.path.extend(firmware.path().iter().skip(then.path.len()));
             }
             world.rig.advance_us(cost_us[usize::from(!predicts)]);
             let ended_us = world.now_us();

@@ -44,7 +44,7 @@ fn without_faults_nothing_is_late_and_nothing_is_noticed() {
     for model in models() {
         let summary = quiet(&model, &driving(&model, 600.0, &[]), 5);
         assert_eq!((summary.deadline_misses, summary.false_alarms()), (0, 0), "{}", summary.text());
-        assert_eq!(summary.worst_tick_us, summary.sample_tick_us);
+        assert_eq!(summary.worst_tick_us, summary.predicting_tick_us);
         assert_eq!(summary.time_s[2..], [0.0, 0.0]);
         assert!(summary.time_s[1] > 598.0 && summary.windows > 500);
         let [frames, lost, dropped, damaged] = summary.frames;
@@ -127,19 +127,19 @@ fn large(sample_time_s: f32) -> (Structure<'static>, Vec<f32>) {
 fn a_model_that_is_too_large_misses_where_its_cost_says() {
     let (structure, coefficients) = large(0.1);
     let model = Model::new(structure, &coefficients, None).unwrap();
-    for (clock_mhz, seconds) in [(168.0, 5.0), (84.0, 5.0)] {
+    for (clock_mhz, seconds) in [(28.0, 5.0), (14.0, 5.0)] {
         let mut scenario = driving(&model, seconds, &[]);
         scenario.controller.clock_mhz = clock_mhz;
-        let [sample, plain] = Robot::Rosbot.instructions(&model, &scenario.controller);
+        let [predicts, plain] = Robot::Rosbot.instructions(&model, &scenario.controller);
         let us = |count: u64| count as f64 * scenario.controller.cycles_per_instruction / clock_mhz;
         let summary = quiet(&model, &scenario, 1);
-        assert!(us(plain) < 100.0);
-        let too_slow = us(sample) > 10_000.0;
-        assert_eq!(too_slow, clock_mhz < 100.0, "{} µs", us(sample));
+        assert!(us(plain) < 300.0);
+        let too_slow = us(predicts) > 10_000.0;
+        assert_eq!(too_slow, clock_mhz < 20.0, "{} µs", us(predicts));
         // The first prediction is at the sample with which the history is full: two before it, of ten ticks.
         let expected = too_slow.then_some(20);
         assert_eq!(summary.first_miss, expected, "{}", summary.text());
-        assert_eq!(summary.worst_tick_us, us(sample).ceil() as u64);
+        assert_eq!(summary.worst_tick_us, us(predicts).ceil() as u64);
         assert_eq!(summary.time_s[1] > 3.0, !too_slow, "a late loop does not keep running");
         assert_eq!(summary.driven_at_rest, 0);
     }

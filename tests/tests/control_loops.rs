@@ -1205,26 +1205,41 @@ fn inputs_of_a_sample_are_the_mean_of_its_ticks() {
             let mut now_us = 0;
             let mut expected = [0.0_f32; 2];
             run(robot, &mut now_us, period_us, 1);
-            assert_eq!(frames.dequeue().unwrap().applied, [0.0, 0.0], "the first tick is a sample");
+            let mut samples = std::collections::VecDeque::from([(0, [0.0; 2])]);
+            if ticks < 4 {
+                assert_eq!(
+                    frames.dequeue().unwrap().applied,
+                    [0.0, 0.0],
+                    "the first tick is a sample"
+                );
+                samples.clear();
+            }
             robot.command(Command::Start);
-            // The tick that is a sample belongs to the next one.
+            // The tick that is a sample belongs to the next one; its frame comes when the look-ahead is there.
             for tick in 1..=3 * ticks {
                 let u = [tick as f32 / 8.0 % 9.0, -2.5];
                 robot.command(Command::Inputs(u));
+                let is_sample = tick % ticks == 0;
+                if is_sample {
+                    assert!(samples.is_empty(), "a frame before the next sample");
+                    samples
+                        .push_back((now_us, expected.map(|sum| sum / f32::from(ticks_per_sample))));
+                    expected = [0.0; 2];
+                }
                 run(robot, &mut now_us, period_us, 1);
-                if tick % ticks == 0 {
-                    let frame = frames.dequeue().expect("a sample");
-                    for (applied, sum) in frame.applied.iter().zip(expected) {
-                        let mean = sum / f32::from(ticks_per_sample);
+                assert!(robot.path().is_empty() || robot.path().len() % 3 == 0);
+                if let Some(frame) = frames.dequeue() {
+                    let (time_us, mean) = samples.pop_front().expect("a sample");
+                    assert_eq!(frame.time_us, time_us);
+                    assert_eq!(is_sample, ticks < 4);
+                    for (applied, mean) in frame.applied.iter().zip(mean) {
                         assert!((applied - mean).abs() < 1e-5, "{applied} {mean}");
                     }
-                    assert_eq!(frame.time_us, now_us - period_us);
-                    expected = [0.0; 2];
-                } else {
-                    assert!(frames.dequeue().is_none());
                 }
+                assert!(frames.dequeue().is_none());
                 expected = [0, 1].map(|i| expected[i] + u[i]);
             }
+            assert_eq!(samples.len(), usize::from(ticks >= 4));
         });
     }
 }

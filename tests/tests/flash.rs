@@ -9,6 +9,7 @@ use std::rc::Rc;
 
 use embedded_io::{ErrorType, Read, ReadReady, Write, WriteReady};
 use firmware_core::blob::Aligned;
+use firmware_core::control_loop::supervisor::Report;
 use firmware_core::control_loop::telemetry::{Frames, Queue};
 use firmware_core::control_loop::{
     Alarms, Command, ControlLoop, Frame, Mode, Supervisor, Telemetry, Timing,
@@ -196,8 +197,9 @@ impl ControlLoop<2> for Robot<'_> {
         self.ticks += 1;
         if self.ticks.is_multiple_of(10) {
             let measured = [now_us as f32, 0.5, -0.5].into_iter().collect();
-            let frame = Frame { time_us: now_us, measured, ..Frame::default() };
-            self.telemetry.send(self.supervisor.report(frame));
+            let Report { mode, alarms, noticed, worst_tick_us } = self.supervisor.report();
+            let said = Frame { mode, alarms, noticed, worst_tick_us, ..Frame::default() };
+            self.telemetry.send(Frame { time_us: now_us, measured, ..said });
         }
         self.mode()
     }

@@ -11,7 +11,7 @@
 //! sample.
 
 use crate::control_loop::ControlLoopError;
-use crate::control_loop::supervisor::Supervisor;
+use crate::control_loop::supervisor::{Report, Supervisor};
 use crate::control_loop::telemetry::{Frame, Telemetry};
 use crate::control_loop::tracker::Tracker;
 
@@ -27,8 +27,9 @@ pub struct Rhythm<const M: usize> {
     sum: [f32; M],
     /// The last sample has left nothing to do since the tick before.
     is_done: bool,
-    /// When the sample was whose frame is still to be sent (µs).
-    unsent_us: Option<u64>,
+    /// When the last sample was (µs), and what is to be reported of it, if it is still to be.
+    time_us: u64,
+    report: Option<Report>,
 }
 
 impl<const M: usize> Rhythm<M> {
@@ -41,14 +42,16 @@ impl<const M: usize> Rhythm<M> {
         if ticks_per_sample == 0 {
             return Err(ControlLoopError::Setting { field: "ticks_per_sample" });
         }
-        let steps = steps_per_tick(ticks_per_sample, ahead);
+        let steps =
+            if ticks_per_sample < FEW { usize::MAX } else { most_steps(ticks_per_sample, ahead) };
         Ok(Self {
             ticks_per_sample,
             steps,
             ticks: 0,
             sum: [0.0; M],
             is_done: true,
-            unsent_us: None,
+            time_us: 0,
+            report: None,
         })
     }
 
@@ -67,7 +70,7 @@ impl<const M: usize> Rhythm<M> {
         let ticks = self.ticks();
         let mean = self.sum.map(|sum| sum / ticks);
         (self.sum, self.ticks) = ([0.0; M], 0);
-        self.unsent_us = Some(now_us);
+        self.time_us = now_us;
         mean
     }
 
@@ -87,7 +90,8 @@ impl<const M: usize> Rhythm<M> {
         }
     }
 
-    /// The tick ends: what `acts` from here on; and the last sample's frame, once it is complete.
+    /// The tick ends: what `acts` from here on; and the last sample's frame, once it is complete. What is noticed
+    /// after the sample's tick is left to the frame after that.
     pub fn end<const N: usize, const H: usize>(
         &mut self,
         acts: [f32; M],
@@ -98,22 +102,34 @@ impl<const M: usize> Rhythm<M> {
         for (sum, u) in self.sum.iter_mut().zip(acts) {
             *sum += u;
         }
+        if self.ticks == 0 && telemetry.is_on() {
+            self.report = Some(supervisor.report());
+        }
         self.ticks = self.ticks.saturating_add(1);
         if self.is_done
-            && telemetry.is_on()
-            && let Some(time_us) = self.unsent_us.take()
+            && let Some(report) = self.report.take()
         {
-            telemetry.send(supervisor.report(Frame::of(time_us, tracker)));
+            telemetry.send(Frame::of(self.time_us, report, tracker));
         }
     }
 }
 
-/// How far each tick goes on, so that all is done before the next sample; as far as it goes where ticks are few.
-const fn steps_per_tick(ticks_per_sample: u8, ahead: usize) -> usize {
-    match ticks_per_sample {
-        0..=3 => usize::MAX,
-        // Those but the sample, the second prediction and the frame. The sample itself is to be taken, too.
-        ticks => ahead.saturating_add(1).div_ceil(ticks as usize - 3),
+/// With fewer ticks per sample nothing is spread over them.
+const FEW: u8 = 4;
+
+/// The most steps of the model that a tick makes, of a loop that looks `ahead` so many samples.
+///
+/// ```
+/// use firmware_core::control_loop::rhythm::most_steps;
+/// assert_eq!(most_steps(10, 10), 2); // the ROSbot's loop
+/// assert_eq!(most_steps(25, 20), 1); // the soft leg's
+/// assert_eq!(most_steps(1, 10), 12); // to the sample, ten ahead, and the second prediction's
+/// ```
+pub const fn most_steps(ticks_per_sample: u8, ahead: usize) -> usize {
+    match ticks_per_sample.checked_sub(FEW - 1) {
+        None | Some(0) => ahead.saturating_add(2),
+        // Ticks but the sample, the second prediction and the frame; the sample's measurement is as a step.
+        Some(ticks) => ahead.saturating_add(1).div_ceil(ticks as usize),
     }
 }
 
@@ -125,16 +141,13 @@ mod tests {
     fn all_steps_are_made_before_the_next_sample() {
         for ahead in 0..60_usize {
             for ticks in 1..=255 {
-                let steps = steps_per_tick(ticks, ahead);
+                let steps = most_steps(ticks, ahead);
                 assert!(steps > 0);
-                if steps < usize::MAX {
+                if ticks >= FEW {
                     let path = (ahead + 1).div_ceil(steps);
                     assert!(1 + path + 2 <= ticks.into(), "{ahead} samples, {ticks} ticks");
                 }
             }
         }
-        assert_eq!(steps_per_tick(10, 10), 2);
-        assert_eq!(steps_per_tick(25, 20), 1);
-        assert_eq!(steps_per_tick(1, 20), usize::MAX);
     }
 }

@@ -180,11 +180,10 @@ where
         let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
         let tracked = self.tracker.sample(&self.applied, measured, &next);
         self.supervisor.judge(tracked.alarms, &mut self.tracker);
-        let frame = Frame::of(now_us, &self.tracker);
         let shares = next.map(|u| u / self.settings.supply_volt);
         let mode = self.supervisor.act(&mut self.actuators, shares);
         self.applied = if mode == Mode::Running { next } else { [0.0; 2] };
-        self.telemetry.send(self.supervisor.report(frame));
+        self.telemetry.send(Frame::of(now_us, self.supervisor.report(), &self.tracker));
         mode
     }
 

@@ -15,7 +15,6 @@ use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::control_loop::telemetry::Frame;
 use crate::control_loop::tracker::Tracker;
 use crate::control_loop::{Actuators, Command, ControlLoopError, limited};
 use crate::model::Model;
@@ -227,6 +226,19 @@ enum Order {
     Reset,
 }
 
+/// What the loop is doing, and what was noticed, when a sample is taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Report {
+    /// What it may do.
+    pub mode: Mode,
+    /// What was noticed since the last start or reset.
+    pub alarms: Alarms,
+    /// What was noticed since the report before.
+    pub noticed: Alarms,
+    /// The longest tick since then (µs).
+    pub worst_tick_us: u32,
+}
+
 /// The state machine.
 ///
 /// ```
@@ -429,12 +441,14 @@ impl Supervisor {
         }
     }
 
-    /// A frame with what is known here: mode, alarms, what was noticed and the longest tick since the
-    /// frame before.
-    pub fn report(&mut self, mut frame: Frame) -> Frame {
-        (frame.mode, frame.alarms) = (self.mode, self.alarms);
-        (frame.worst_tick_us, frame.noticed) = (self.take_worst_us(), self.take_recent());
-        frame
+    /// What a frame says of the loop.
+    pub fn report(&mut self) -> Report {
+        Report {
+            mode: self.mode,
+            alarms: self.alarms,
+            noticed: self.take_recent(),
+            worst_tick_us: self.take_worst_us(),
+        }
     }
 
     /// The longest tick since the last call (µs).

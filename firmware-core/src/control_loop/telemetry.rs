@@ -9,7 +9,7 @@ use heapless::spsc;
 use serde::{Deserialize, Serialize};
 
 use crate::capacity::{MAX_INPUTS, MAX_STATES};
-use crate::control_loop::supervisor::{Alarms, Mode};
+use crate::control_loop::supervisor::{Alarms, Mode, Report};
 use crate::control_loop::tracker::Tracker;
 use crate::encoding::Writer;
 
@@ -98,8 +98,7 @@ impl<'q> Telemetry<'q> {
         self.queue.is_some()
     }
 
-    /// Numbers a frame, as [`Supervisor::report`](crate::control_loop::Supervisor::report) made it, and
-    /// puts it into the queue; drops it when the queue is full.
+    /// Numbers a frame, and puts it into the queue; drops it when the queue is full.
     #[inline(never)]
     pub fn send(&mut self, mut frame: Frame) {
         (frame.sequence, frame.dropped) = (self.sequence, self.dropped);
@@ -117,15 +116,20 @@ impl<'q> Telemetry<'q> {
 }
 
 impl Frame {
-    /// The frame of the last sample of a tracker, which was at `time_us`.
+    /// The frame of the last sample of a tracker, which was at `time_us`, and what its loop reported then.
     pub fn of<const N: usize, const M: usize, const H: usize>(
         time_us: u64,
+        report: Report,
         tracker: &Tracker<'_, '_, N, M, H>,
     ) -> Self {
         let tracked = tracker.tracked();
         let optional = |x| Option::as_ref(x).map_or(&[][..], <[f32; N]>::as_slice);
         let mut frame = Self {
             time_us,
+            mode: report.mode,
+            alarms: report.alarms,
+            noticed: report.noticed,
+            worst_tick_us: report.worst_tick_us,
             steps: tracked.steps,
             bound_steps: tracked.bound_steps,
             ..Self::default()

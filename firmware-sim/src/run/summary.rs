@@ -108,8 +108,8 @@ pub struct Summary {
     pub first_miss: Option<u64>,
     /// The longest tick (µs).
     pub worst_tick_us: u64,
-    /// What a sample's tick costs by the cost table (µs).
-    pub sample_tick_us: u64,
+    /// What a tick that predicts costs by the cost table (µs).
+    pub predicting_tick_us: u64,
     /// Seconds in Idle, Running, Safe, and without supply.
     pub time_s: [f64; 4],
     /// Ticks after which something was driven though the loop was not Running: must be 0.
@@ -207,7 +207,7 @@ impl<const N: usize> Watch<N> {
             deadline_misses: 0,
             first_miss: None,
             worst_tick_us: 0,
-            sample_tick_us: cost_us[0],
+            predicting_tick_us: cost_us[0],
             time_s: [0.0; 4],
             driven_at_rest: 0,
             resets: 0,
@@ -489,9 +489,9 @@ impl Summary {
         line(
             "worst tick",
             format!(
-                "{} µs; one with a sample of the model costs {} µs by the cost table",
+                "{} µs; one that predicts costs {} µs by the cost table",
                 grouped(self.worst_tick_us),
-                grouped(self.sample_tick_us)
+                grouped(self.predicting_tick_us)
             ),
         );
         let [idle, running, safe, off] = self.time_s.map(|s| format!("{s:.2}"));

@@ -19,6 +19,7 @@ use cortex_m_rt::entry;
 use cortex_m_semihosting::hprintln;
 use embedded_storage::nor_flash::NorFlash;
 use firmware_core::blob::Aligned;
+use firmware_core::control_loop::rhythm::most_steps;
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
 use firmware_core::control_loop::telemetry::{Frames, Queue};
@@ -123,7 +124,8 @@ const fn instructions(period_us: u32, steps: u32) -> u32 {
 
 #[inline(never)]
 fn rosbot(controller: Controller) -> Option<()> {
-    let capacities = Capacities::new::<3, 2>(100_000, instructions(10_000, 12));
+    let capacities =
+        Capacities::new::<3, 2>(100_000, instructions(10_000, most_steps(10, 10) as u32));
     let of = Of { name: "skid-rosbot", factory: &ROSBOT.0, capacities, period_us: 10_000 };
     let Controller { clock, link, line, key } = controller;
     let Booted { mut updater, blob } = boot(&of, key)?;
@@ -143,7 +145,8 @@ fn rosbot(controller: Controller) -> Option<()> {
 
 #[inline(never)]
 fn leg(controller: Controller) -> Option<()> {
-    let capacities = Capacities::new::<2, 2>(50_000, instructions(50_000, 22));
+    let capacities =
+        Capacities::new::<2, 2>(50_000, instructions(50_000, most_steps(1, 20) as u32));
     let of = Of { name: "soft-leg", factory: &LEG.0, capacities, period_us: 50_000 };
     let Controller { clock, link, line, key } = controller;
     let Booted { mut updater, blob } = boot(&of, key)?;
