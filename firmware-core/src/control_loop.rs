@@ -47,8 +47,9 @@ pub use tracker::{Measurement, Tracker};
 pub enum Command<const M: usize> {
     /// Idle → Running. Refused without a measurement.
     Start,
-    /// The inputs from the next tick on; each is held within the range of the model. Only a running
-    /// robot follows them. They also say that the host is alive.
+    /// The inputs from the next tick on, or from the next sample on where the model wants them constant in
+    /// between; each is held within the range of the model. Only a running robot follows them. They also say
+    /// that the host is alive.
     Inputs([f32; M]),
     /// → Idle.
     Stop,

@@ -340,6 +340,14 @@ impl<A: Actuators<2>> Actuators<2> for Checked<A> {
 const LEG_US: u64 = 50_000;
 const ROSBOT_US: u64 = 10_000;
 
+/// A leg whose every tick is a sample.
+const LEG_SETTINGS: SoftLegSettings = SoftLegSettings {
+    ticks_per_sample: 1,
+    supply_volt: 12.0,
+    watchdog_us: 1_000_000,
+    blind_samples: 10,
+};
+
 /// Builds a leg on a rig and hands it, with its frames, to a test.
 fn leg<T>(
     model: &Model<'static>,
@@ -544,7 +552,7 @@ fn no_sequence_of_events_leaves_an_actuator_on() {
             let rig = Rig::default();
             let watchdog_us = if short { 300_000 } else { 10_000_000 };
             let ran = if name == "leg" {
-                let settings = SoftLegSettings { watchdog_us, ..SoftLegSettings::default() };
+                let settings = SoftLegSettings { watchdog_us, ..LEG_SETTINGS };
                 leg(model, &rig, settings, |robot, frames| {
                     whatever_happens(robot, frames, &rig, LEG_US, &events)
                 })
@@ -637,7 +645,7 @@ fn an_actuator_that_fails_stops_the_robot_in_the_same_tick() {
                     let rig = Rig::new(is_leg);
                     rig.0.borrow_mut().broken = Some(broken);
                     let outcome = if is_leg {
-                        leg(&PLAIN, &rig, SoftLegSettings::default(), |robot, frames| {
+                        leg(&PLAIN, &rig, LEG_SETTINGS, |robot, frames| {
                             with_broken(robot, frames, &rig, LEG_US, broken)
                         })
                     } else {
@@ -690,7 +698,7 @@ fn leg_in<T>(
     test: impl FnOnce(&mut dyn ControlLoop<2>, &mut Frames<'_>, &Rig, u64) -> T,
 ) -> T {
     let rig = Rig::new(true);
-    leg(&PLAIN_BOUNDED, &rig.clone(), SoftLegSettings::default(), |robot, frames| {
+    leg(&PLAIN_BOUNDED, &rig.clone(), LEG_SETTINGS, |robot, frames| {
         let mut now_us = 0;
         run(robot, &mut now_us, LEG_US, 2);
         if mode != Mode::Idle {
@@ -921,7 +929,7 @@ fn a_start_without_a_measurement_is_refused() {
             }
         };
         if is_leg {
-            leg(&LEG, &rig, SoftLegSettings::default(), test);
+            leg(&LEG, &rig, LEG_SETTINGS, test);
         } else {
             rosbot(&ROSBOT, &rig, RosbotSettings::default(), test);
         }
@@ -1111,7 +1119,7 @@ fn a_sensor_too_slow_for_the_model_to_predict_is_lost() {
     // could be predicted; after that it may be blind for the eight samples of the bounds.
     let allowed = LEG_BOUNDED.structure().lag() + 1 + 8;
     let rig = Rig::new(true);
-    leg(&LEG_BOUNDED, &rig.clone(), SoftLegSettings::default(), |robot, frames| {
+    leg(&LEG_BOUNDED, &rig.clone(), LEG_SETTINGS, |robot, frames| {
         let mut now_us = 0;
         for sample in 0..40 {
             rig.measures(Some((sample % 2 == 0).then_some([0.0; 3])));

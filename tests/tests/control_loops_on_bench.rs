@@ -128,7 +128,10 @@ fn bend(model: &Model<'static>, (gaps, spike): (bool, f32), seconds: u64) -> Vec
     let sensor = Gappy { sensor: devices.tip, gaps, spike, samples: 0 };
     let mut queue = Queue::<4>::new();
     let (producer, mut consumer) = queue.split();
-    let (settings, telemetry) = (SoftLegSettings::default(), Telemetry::new(producer));
+    let (settings, telemetry) = (
+        SoftLegSettings { ticks_per_sample: 1, ..SoftLegSettings::default() },
+        Telemetry::new(producer),
+    );
     let mut robot = SoftLeg::<_, _, 5>::new(model, actuators, sensor, settings, telemetry).unwrap();
     let (mut frames, mut seed) = (Vec::new(), 1);
     for tick in 0..=seconds * 1_000_000 / LEG_US {

@@ -15,7 +15,7 @@ use crate::control_loop::supervisor::{Report, Supervisor};
 use crate::control_loop::telemetry::{Frame, Telemetry};
 use crate::control_loop::tracker::Tracker;
 
-/// What a loop with several ticks per sample keeps of them, and its `M` inputs' sums.
+/// What a loop with `M` inputs and several ticks per sample keeps of them.
 #[derive(Clone, Debug)]
 pub struct Rhythm<const M: usize> {
     ticks_per_sample: u8,
@@ -23,8 +23,8 @@ pub struct Rhythm<const M: usize> {
     steps: usize,
     /// Ticks since the last sample.
     ticks: u8,
-    /// Sum of what acted over them.
-    sum: [f32; M],
+    /// Mean of what acted over them.
+    mean: [f32; M],
     /// The last sample has left nothing to do since the tick before.
     is_done: bool,
     /// When the last sample was (µs), and what is to be reported of it, if it is still to be.
@@ -48,15 +48,20 @@ impl<const M: usize> Rhythm<M> {
             ticks_per_sample,
             steps,
             ticks: 0,
-            sum: [0.0; M],
+            mean: [0.0; M],
             is_done: true,
             time_us: 0,
             report: None,
         })
     }
 
-    /// Whether this tick is a sample.
-    pub fn is_sample(&self) -> bool {
+    /// A tick begins; `applied` acted since the one before. Whether it is a sample.
+    pub fn begin(&mut self, applied: [f32; M]) -> bool {
+        let ticks = self.ticks();
+        for (mean, u) in self.mean.iter_mut().zip(applied) {
+            // The mean of equal inputs is exactly those.
+            *mean += (u - *mean) / ticks;
+        }
         self.ticks == 0 || self.ticks >= self.ticks_per_sample
     }
 
@@ -67,11 +72,8 @@ impl<const M: usize> Rhythm<M> {
 
     /// A sample at `now_us`: what acted since the one before it, on average.
     pub fn sample(&mut self, now_us: u64) -> [f32; M] {
-        let ticks = self.ticks();
-        let mean = self.sum.map(|sum| sum / ticks);
-        (self.sum, self.ticks) = ([0.0; M], 0);
-        self.time_us = now_us;
-        mean
+        (self.ticks, self.time_us) = (0, now_us);
+        core::mem::replace(&mut self.mean, [0.0; M])
     }
 
     /// Goes on with what the last sample has left to do for this tick.
@@ -90,18 +92,14 @@ impl<const M: usize> Rhythm<M> {
         }
     }
 
-    /// The tick ends: what `acts` from here on; and the last sample's frame, once it is complete. What is noticed
-    /// after the sample's tick is left to the frame after that.
+    /// The tick ends: the last sample's frame is sent, once it is complete. What is noticed after the sample's tick
+    /// is left to the frame after that.
     pub fn end<const N: usize, const H: usize>(
         &mut self,
-        acts: [f32; M],
         tracker: &Tracker<'_, '_, N, M, H>,
         supervisor: &mut Supervisor,
         telemetry: &mut Telemetry<'_>,
     ) {
-        for (sum, u) in self.sum.iter_mut().zip(acts) {
-            *sum += u;
-        }
         if self.ticks == 0 && telemetry.is_on() {
             self.report = Some(supervisor.report());
         }

@@ -204,7 +204,8 @@ pub struct Rosbot<'m, 'a, 'q, A, E, S, const H: usize> {
     telemetry: Telemetry<'q>,
     /// What the host wants (rad/s), right and left.
     wanted: [f32; 2],
-    /// Of what was commanded.
+    /// What is commanded since the last tick (rad/s).
+    applied: [f32; 2],
     rhythm: Rhythm<2>,
     sides: [Side; 2],
     /// Whether there is a count to compare the next one with.
@@ -231,7 +232,6 @@ where
         telemetry: Telemetry<'q>,
     ) -> Result<Self, ControlLoopError> {
         let tracker = Tracker::new(model, settings.blind_samples)?;
-        let rhythm = Rhythm::new(settings.ticks_per_sample, H)?;
         for (field, value) in [
             ("counts_per_turn", settings.counts_per_turn),
             ("supply_volt", settings.supply_volt),
@@ -257,7 +257,8 @@ where
             supervisor: Supervisor::new(timing),
             telemetry,
             wanted: [0.0; 2],
-            rhythm,
+            applied: [0.0; 2],
+            rhythm: Rhythm::new(settings.ticks_per_sample, H)?,
             sides: [Side::default(); 2],
             counted: false,
             bad_counts: 0,
@@ -355,7 +356,7 @@ where
         self.supervisor.begin(now_us);
         self.count();
         // The first tick is a sample, and every `ticks_per_sample`th from there on.
-        if self.rhythm.is_sample() {
+        if self.rhythm.begin(self.applied) {
             self.sample(now_us);
         }
         self.rhythm.go_on(&mut self.tracker, &mut self.supervisor);
@@ -374,11 +375,11 @@ where
             self.forget();
         }
         let mode = self.supervisor.act(&mut self.actuators, shares);
-        let applied = if mode == Mode::Running { self.wanted } else { [0.0; 2] };
-        for (side, command) in self.sides.iter_mut().zip(applied) {
+        self.applied = if mode == Mode::Running { self.wanted } else { [0.0; 2] };
+        for (side, command) in self.sides.iter_mut().zip(self.applied) {
             side.deviation += side.speed - command;
         }
-        self.rhythm.end(applied, &self.tracker, &mut self.supervisor, &mut self.telemetry);
+        self.rhythm.end(&self.tracker, &mut self.supervisor, &mut self.telemetry);
         mode
     }
 

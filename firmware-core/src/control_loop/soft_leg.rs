@@ -2,17 +2,24 @@
 //! one for vacuum.
 //!
 //! The model's inputs are signed voltages: the sign chooses the pump (+ input, − exhaust), the size opens
-//! the valve. A tick is a sample of the model: every tick the tip is predicted, compared with the measured
-//! one where there is one, and predicted over the horizon with the voltages that are commanded now.
+//! the valve. Every tick (2 ms) sets valves and pumps anew: what ends the motion, whether a stop, a silent
+//! host, a late tick or a device that fails, ends it then. Every `ticks_per_sample` ticks (50 ms) is a sample
+//! of the model: the tip is predicted, and compared with the measured one where there is one. At the ticks that
+//! follow it is predicted over the horizon with the voltages that are commanded then, a step at each.
+//!
+//! The model assumes inputs that are constant from one sample to the next: commanded voltages act from the
+//! next sample on. A leg that is started between two samples has its valves closed until then. One that was
+//! switched off between them is predicted with the mean of what acted.
 
 use embedded_hal::digital::OutputPin;
 use embedded_hal::pwm::SetDutyCycle;
 
+use crate::control_loop::rhythm::Rhythm;
 use crate::control_loop::supervisor::{Mode, Supervisor, Timing};
-use crate::control_loop::telemetry::{Frame, Telemetry};
+use crate::control_loop::telemetry::Telemetry;
 use crate::control_loop::tracker::Tracker;
 use crate::control_loop::{
-    ActuatorError, Actuators, Command, ControlLoop, ControlLoopError, set_share,
+    ActuatorError, Actuators, Command, ControlLoop, ControlLoopError, limited, set_share,
 };
 use crate::device::PositionSensor;
 use crate::model::Model;
@@ -91,6 +98,8 @@ where
 /// What fixes the loop of a leg.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SoftLegSettings {
+    /// Ticks per sample of the model; from four on the look-ahead is spread over them.
+    pub ticks_per_sample: u8,
     /// Voltage of the supply: the full duty of a valve (V).
     pub supply_volt: f32,
     /// A running leg stops after this time without a command (µs).
@@ -101,9 +110,10 @@ pub struct SoftLegSettings {
 }
 
 impl Default for SoftLegSettings {
-    /// 12 V, one second without a command, half a second without a measurement at 20 Hz.
+    /// 25 ticks of 2 ms per sample, 12 V, one second without a command, half a second without a measurement
+    /// at 20 Hz.
     fn default() -> Self {
-        Self { supply_volt: 12.0, watchdog_us: 1_000_000, blind_samples: 10 }
+        Self { ticks_per_sample: 25, supply_volt: 12.0, watchdog_us: 1_000_000, blind_samples: 10 }
     }
 }
 
@@ -117,8 +127,11 @@ pub struct SoftLeg<'m, 'a, 'q, A, S, const H: usize> {
     telemetry: Telemetry<'q>,
     /// What the host wants (V).
     wanted: [f32; 2],
+    /// What is commanded from the last sample to the next (V); 0 once the leg has not been running.
+    held: [f32; 2],
     /// What acts since the last tick (V).
     applied: [f32; 2],
+    rhythm: Rhythm<2>,
 }
 
 impl<'m, 'a, 'q, A, S, const H: usize> SoftLeg<'m, 'a, 'q, A, S, H>
@@ -126,7 +139,7 @@ where
     A: Actuators<2>,
     S: PositionSensor<2>,
 {
-    /// A leg that is idle; the model's sample time is the period of its ticks.
+    /// A leg that is idle; the model's sample time is `ticks_per_sample` periods of its ticks.
     ///
     /// # Errors
     /// [`ControlLoopError`]: the model is not one of two states and two inputs, or a setting is out of
@@ -143,21 +156,33 @@ where
         if !(settings.supply_volt > 0.0 && settings.supply_volt.is_finite()) {
             return Err(ControlLoopError::Setting { field: "supply_volt" });
         }
+        let timing = Timing::new(model, settings.ticks_per_sample.into(), settings.watchdog_us)?;
         Ok(Self {
             actuators,
             sensor,
             settings,
             tracker,
-            supervisor: Supervisor::new(Timing::new(model, 1, settings.watchdog_us)?),
+            supervisor: Supervisor::new(timing),
             telemetry,
             wanted: [0.0; 2],
+            held: [0.0; 2],
             applied: [0.0; 2],
+            rhythm: Rhythm::new(settings.ticks_per_sample, H)?,
         })
     }
 
     /// The devices, to look at.
     pub fn devices(&self) -> (&A, &S) {
         (&self.actuators, &self.sensor)
+    }
+
+    /// A sample of the model.
+    fn sample(&mut self, now_us: u64) {
+        let applied = self.rhythm.sample(now_us);
+        let measured = self.tracker.measure(&mut self.sensor);
+        self.held = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
+        let noticed = self.tracker.take(&applied, measured, &self.held);
+        self.supervisor.judge(noticed, &mut self.tracker);
     }
 }
 
@@ -170,27 +195,35 @@ where
         self.supervisor.follow(command, &mut self.wanted, &self.tracker);
         // A model may have been trained with a larger supply: what is predicted and reported is what acts.
         let most = self.settings.supply_volt;
-        self.wanted = self.wanted.map(|u| u.max(-most).min(most));
+        self.wanted = self.wanted.map(|u| limited(u, -most, most));
+        if self.supervisor.mode() != Mode::Running {
+            // Also when a start follows before the next tick.
+            self.held = [0.0; 2];
+        }
     }
 
-    /// One tick: measures, predicts, acts, reports.
+    /// One tick: acts; at a sample it measures and predicts, at the ticks after it it looks ahead, and reports.
     fn tick(&mut self, now_us: u64) -> Mode {
         self.supervisor.begin(now_us);
-        let measured = self.tracker.measure(&mut self.sensor);
-        let next = if self.supervisor.mode() == Mode::Running { self.wanted } else { [0.0; 2] };
-        let tracked = self.tracker.sample(&self.applied, measured, &next);
-        self.supervisor.judge(tracked.alarms, &mut self.tracker);
-        let shares = next.map(|u| u / self.settings.supply_volt);
+        if self.rhythm.begin(self.applied) {
+            self.sample(now_us);
+        }
+        self.rhythm.go_on(&mut self.tracker, &mut self.supervisor);
+
+        let shares = self.held.map(|u| u / self.settings.supply_volt);
         let mode = self.supervisor.act(&mut self.actuators, shares);
-        self.applied = if mode == Mode::Running { next } else { [0.0; 2] };
-        self.telemetry.send(Frame::of(now_us, self.supervisor.report(), &self.tracker));
+        if mode != Mode::Running {
+            self.held = [0.0; 2];
+        }
+        self.applied = self.held;
+        self.rhythm.end(&self.tracker, &mut self.supervisor, &mut self.telemetry);
         mode
     }
 
     fn finish(&mut self, now_us: u64) -> Mode {
         let mode = self.supervisor.finish(now_us, &mut self.actuators);
         if mode != Mode::Running {
-            self.applied = [0.0; 2];
+            (self.held, self.applied) = ([0.0; 2], [0.0; 2]);
         }
         mode
     }

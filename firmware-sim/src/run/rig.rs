@@ -130,7 +130,7 @@ impl Rig<2> for SoftLegBench {
             exhaust_pump,
         };
         let tip = FaultySensor::new(devices.tip, faults, Self::SPIKE);
-        let settings = SoftLegSettings::default();
+        let settings = SoftLegSettings { ticks_per_sample: 1, ..SoftLegSettings::default() };
         SoftLeg::<_, _, { Self::AHEAD }>::new(model, pneumatics, tip, settings, telemetry)
     }
 

@@ -160,7 +160,10 @@ fn leg(controller: Controller) -> Option<()> {
     };
     let mut queue = Queue::<QUEUE>::new();
     let (producer, mut frames) = queue.split();
-    let (settings, telemetry) = (SoftLegSettings::default(), Telemetry::new(producer));
+    let (settings, telemetry) = (
+        SoftLegSettings { ticks_per_sample: 1, ..SoftLegSettings::default() },
+        Telemetry::new(producer),
+    );
     let tip = plant.position();
     let mut robot = SoftLeg::<_, _, 20>::new(&model, pneumatics, tip, settings, telemetry).ok()?;
     run(&of, &mut robot, &mut updater, &mut frames, &plant, (clock, link))

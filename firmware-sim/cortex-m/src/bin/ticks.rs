@@ -44,7 +44,7 @@ fn measure() -> Option<()> {
     line("skid-rosbot", alone, worst(robot, Some(frames), rhythm)?, per_tick);
 
     firmware::leg_model(&mut model)?;
-    let rhythm = (50_000, 1);
+    let rhythm = (2_000, 25);
     let alone = worst(firmware::leg_loop(&model, Telemetry::off())?, None, rhythm)?;
     let (producer, frames) = other.split();
     let robot = firmware::leg_loop(&model, Telemetry::new(producer))?;
