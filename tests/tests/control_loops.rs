@@ -7,19 +7,23 @@ use std::sync::LazyLock;
 
 use embedded_hal::digital::{self, OutputPin};
 use embedded_hal::pwm::{self, SetDutyCycle};
-use firmware_core::Model;
 use firmware_core::blob::Aligned;
+use firmware_core::capacity::{MAX_KEPT, MAX_LAG};
 use firmware_core::control_loop::monitor::{FAR, GATE};
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
 use firmware_core::control_loop::telemetry::{Frames, Queue};
 use firmware_core::control_loop::tracker::Tracked;
 use firmware_core::control_loop::{
-    ActuatorError, Actuators, Alarms, Command, ControlLoop, Frame, Measurement, Mode, Rosbot,
-    SoftLeg, Supervisor, Telemetry, Timing, Tracker,
+    ActuatorError, Actuators, Alarms, Command, ControlLoop, ControlLoopError, Frame, Measurement,
+    Mode, Rosbot, SoftLeg, Supervisor, Telemetry, Timing, Tracker,
 };
 use firmware_core::device::{EncoderCount, PositionSensor};
+use firmware_core::dictionary::{Basis, Block, Factor, Observable, Source};
 use firmware_core::error_bounds::ErrorBounds;
+use firmware_core::model::{Provenance, Space, State, Symmetry, Target};
+use firmware_core::update::Capacities;
+use firmware_core::{Model, ModelRepr, Structure};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 use trainer::edmd;
@@ -1057,6 +1061,109 @@ proptest! {
         prop_assert!((tracked.ratio - 0.25).abs() < 1e-3, "the bound of two steps: {}", tracked.ratio);
         prop_assert!(tracker.sees());
     }
+}
+
+/// What a sensor says of a leg that is predicted at `expected`, by a number.
+fn said(what: u8, expected: [f32; 2], off: f32) -> Measurement<2> {
+    let [y, z] = expected;
+    match what {
+        0 => Measurement::Missing,
+        1 => Measurement::Late,
+        2 => Measurement::Unreadable,
+        3 => Measurement::Taken([f32::NAN, 0.0]),
+        4 => Measurement::Taken([y + 1e3 * off, z]),
+        _ => Measurement::Taken([y + off, z - off]),
+    }
+}
+
+proptest! {
+    #![proptest_config(Config { failure_persistence: None, ..Config::default() })]
+
+    /// However the work of a sample is spread over ticks, what comes out is the same, to the bit.
+    #[test]
+    fn work_that_is_spread_is_the_same_work(
+        samples in prop::collection::vec((0..12_u8, -3.0..3.0_f32, -12.0..12.0_f32, 1..9_usize), 1..80),
+        plain in any::<bool>(),
+    ) {
+        let model = if plain { &PLAIN_BOUNDED } else { &LEG_BOUNDED };
+        let mut at_once = Tracker::<2, 2, 7>::new(model, 10).unwrap();
+        let mut spread = at_once.clone();
+        for (what, off, u, steps) in samples {
+            let (applied, held) = ([u, 0.5 * u], [u, -u]);
+            let expected = at_once.clone().sample(&applied, Measurement::Missing, &held).predicted;
+            let measured = said(what, expected.unwrap_or_default(), off);
+            let whole = at_once.sample(&applied, measured, &held);
+            let mut noticed = spread.take(&applied, measured, &held);
+            prop_assert!(spread.path().is_empty() && !spread.is_done());
+            prop_assert_eq!(spread.sees(), at_once.sees());
+            // To the history, seven samples ahead, and the second prediction in a call of its own.
+            let calls = 8_usize.div_ceil(steps) + 1;
+            for call in 1..=calls {
+                let before = spread.path().len();
+                noticed |= spread.go_on(steps);
+                prop_assert!(spread.path().len() - before <= steps);
+                prop_assert!(spread.is_done() || call < calls);
+            }
+            prop_assert_eq!(noticed, whole.alarms);
+            prop_assert_eq!(spread.tracked(), whole);
+            prop_assert_eq!(spread.path(), at_once.path());
+        }
+    }
+}
+
+#[test]
+fn a_sample_that_comes_too_early_loses_the_path_alone() {
+    let mut whole = tracker(&LEG_BOUNDED, 10);
+    let mut early = whole.clone();
+    for k in 0..40_u8 {
+        let u = [f32::from(k % 7) - 3.0, 1.0];
+        let place = Measurement::Taken([0.1 * f32::from(k), -0.2 * f32::from(k)]);
+        let measured = if k % 5 == 0 { Measurement::Missing } else { place };
+        let expected = whole.sample(&u, measured, &u);
+        early.take(&u, measured, &u);
+        early.go_on(usize::from(k % 3));
+        assert_eq!(early.tracked().predicted, expected.predicted, "{k}");
+        assert_eq!(early.tracked().measured, expected.measured, "{k}");
+    }
+}
+
+#[test]
+fn a_model_that_keeps_more_than_there_is_room_for_is_refused() {
+    // Of every coordinate the oldest sample and the oldest change are looked at.
+    let observable = |source| Observable { source, lag: MAX_LAG as u8, centre: 0.0, gain: 1.0 };
+    let sources = (0..8).flat_map(|i| [Source::State(i), Source::Increment(i)]);
+    let state = State {
+        name: "x",
+        unit: "m",
+        space: Space::Line,
+        target: Target::Increment,
+        limit: [f32::MIN, f32::MAX],
+    };
+    let structure = Structure::try_from(ModelRepr {
+        robot: "wide",
+        sample_time_s: 0.1,
+        states: [state; 8].into_iter().collect(),
+        inputs: [].into_iter().collect(),
+        symmetry: Symmetry::None,
+        observables: sources.map(observable).collect(),
+        factors: (0..16)
+            .map(|observable| Factor { observable, basis: Basis::Hermite, order: 1 })
+            .collect(),
+        blocks: [Block { factors: 1, max_degree: 0 }; 16].into_iter().collect(),
+        provenance: Provenance { logs: [0; 32], robot: [0; 32] },
+    });
+    let coefficients = [0.0; 8 * 2 * 16];
+    let model = Model::new(structure.unwrap(), &coefficients, None).unwrap();
+    let found = model.structure().kept();
+    assert_eq!(found, 8 * (4 + 6 + 5));
+    let field = "numbers of the history";
+    let error = Tracker::<8, 0, 3>::new(&model, 10).unwrap_err();
+    let expected = MAX_KEPT;
+    assert_eq!(error, ControlLoopError::DimensionMismatch { field, expected, found });
+    // An update says so before it is installed.
+    let capacities = Capacities { room: 1 << 20, ..Capacities::new::<8, 0>(100_000, 0) };
+    let misfit = capacities.check(&model, 1000).unwrap_err();
+    assert_eq!((misfit.field, misfit.expected, misfit.found), (field, 84, 120));
 }
 
 #[test]
