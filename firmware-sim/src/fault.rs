@@ -9,7 +9,7 @@
 //! | `delay` | measurements arrive later | | the delay (s) |
 //! | `missed-counts` | the encoder misses counts | side: 0 right, 1 left | probability per count |
 //! | `wrap` | the encoder starts near its wrap, from the beginning on, whatever its times | side | where it starts, in units of 65535 |
-//! | `stuck-valve` | the valve stays at the opening that it has | chamber: 0 bending, 1 extension | probability per tick |
+//! | `stuck-valve` | the valve stays at the opening that it has | chamber: 0 bending, 1 extension | probability, drawn every 50 ms |
 //! | `open-valve` | the valve is open to the selected line, whatever its voltage | chamber | how far, 1 is fully |
 //! | `leak` | the chamber leaks faster | chamber | i: by 1 + 99 i |
 //! | `pump` | the pump reaches less pressure | 0 input, 1 exhaust | share that is lost; with 1 its line is open to the outside |
@@ -19,7 +19,8 @@
 //! | `silence` | what the host sends is lost | | probability per write |
 //! | `brown-out` | the microcontroller's supply dips | | share that is lost |
 //!
-//! Without a unit, all units are hit. A fault of the plant counts once per unit and tick. Sensors, encoders and the host's line are wrapped
+//! Without a unit, all units are hit. A fault of the plant counts once per unit and tick, a stuck valve once
+//! per draw. Sensors, encoders and the host's line are wrapped
 //! ([`faulty`](crate::faulty)); the plant's faults act through the `apply` of a
 //! [`bench`](mod@crate::bench); ticks and the microcontroller's supply are the business of whoever
 //! runs the loop, who asks [`Faults::late_by_us`] and [`Faults::act`].
@@ -345,6 +346,11 @@ impl Faults {
             worst.count();
         }
         strikes
+    }
+
+    /// Whether a fault of a kind in a unit is active, which does not count.
+    pub fn is_active(&self, kind: FaultKind, unit: Option<usize>) -> bool {
+        self.worst(kind, unit).is_some()
     }
 
     /// By how much the next tick of a loop with this period is late (µs).

@@ -482,7 +482,7 @@ fn plant(args: &PlantArgs) -> Result<(), Box<dyn Error>> {
         out.flush()?;
         let (name, link, seed, drives) = (link.clone(), open(link)?, args.seed, args.drive);
         std::thread::spawn(move || {
-            let Err(error) = apart::pass_on(link, robot, (&scenario, seed), door, drives);
+            let Err(error) = apart::pass_on(link, (&scenario, seed), door, drives);
             let _ = writeln!(std::io::stderr(), "{name}: {error}");
         });
     }

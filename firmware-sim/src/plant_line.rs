@@ -10,7 +10,9 @@
 //! ```
 //!
 //! The controller keeps the time; the robot's stands still until it hears of the next tick. Before its first
-//! tick the controller sends number 0, with everything off.
+//! tick the controller sends number 0, with everything off. A tick is 10 ms here, of both robots: the loop of
+//! the leg has 5 of them per sample, not the 25 of 2 ms by which it usually ticks, since both frames have to
+//! be there within one.
 //!
 //! What is lost is not sent again. Without the sensors of its last frame when a tick begins, a controller's
 //! sensors cannot be read in that tick: its loop bears some such ticks in a row, and then switches off, as it

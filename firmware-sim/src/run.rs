@@ -429,7 +429,7 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
         ..UartSettings::default()
     };
     let (host_end, mut serial) = uart::pair(&clock, line, seed);
-    let laptop = laptop(host_end, &faults, Host::new(scenario, R::TICK_US, seed));
+    let laptop = laptop(host_end, &faults, Host::new(scenario, seed));
     let supply = Wire::new(SUPPLY_VOLT);
     let detector = BrownOutDetector::new(&supply, BROWN_OUT_VOLT, 0.1);
 
@@ -512,9 +512,9 @@ fn run_rig<R: Rig<N>, L: Laptop, const N: usize>(
             // While the model's history fills there is nothing to predict.
             let predicts = of_boot / R::TICKS_PER_SAMPLE >= lag;
             of_boot += 1;
-            let truth = world.rig.truth();
+            let truth = is_sample.then(|| world.rig.truth());
             firmware.tick(began_us);
-            if is_sample {
+            if let Some(truth) = truth {
                 if world.pending.len() == MOST_PENDING {
                     world.pending.pop_front();
                 }

@@ -64,7 +64,7 @@ fn run_prints_a_table_and_writes_what_it_is_asked_for() {
 
     let json = succeed(folder, &["run", SOFT_LEG, "--seconds", "20", "--json"]);
     let value: serde_json::Value = serde_json::from_str(&json).unwrap();
-    assert_eq!(value["ticks"], 400);
+    assert_eq!(value["ticks"], 10_000);
     assert_eq!(value["deadline_misses"], 0);
     assert_eq!(value["robot"], "soft-leg");
 

@@ -556,9 +556,11 @@ fn no_sequence_of_events_leaves_an_actuator_on() {
             let rig = Rig::default();
             let watchdog_us = if short { 300_000 } else { 10_000_000 };
             let ran = if name == "leg" {
-                let settings = SoftLegSettings { watchdog_us, ..LEG_SETTINGS };
+                let ticks_per_sample = if short { 1 } else { 3 };
+                let settings = SoftLegSettings { watchdog_us, ticks_per_sample, ..LEG_SETTINGS };
+                let period_us = LEG_US / u64::from(ticks_per_sample);
                 leg(model, &rig, settings, |robot, frames| {
-                    whatever_happens(robot, frames, &rig, LEG_US, &events)
+                    whatever_happens(robot, frames, &rig, period_us, &events)
                 })
             } else {
                 let ticks_per_sample = if short { 2 } else { 10 };
@@ -638,33 +640,34 @@ fn with_broken(
 #[test]
 fn an_actuator_that_fails_stops_the_robot_in_the_same_tick() {
     let mut counts = [0_usize; 2];
-    for is_leg in [true, false] {
+    // A leg whose ticks are samples, one with five ticks each, and a ROSbot.
+    for (is_leg, ticks_per_sample) in [(true, 1), (true, 5), (false, 10)] {
         let devices = if is_leg { PWM..ENCODER } else { PWM..PUMP };
-        for device in devices {
-            for call in 1..40 {
-                for (forever, does_it) in
-                    [(false, false), (false, true), (true, false), (true, true)]
-                {
-                    let broken = Broken { device, call, forever, does_it };
-                    let rig = Rig::new(is_leg);
-                    rig.0.borrow_mut().broken = Some(broken);
-                    let outcome = if is_leg {
-                        leg(&PLAIN, &rig, LEG_SETTINGS, |robot, frames| {
-                            with_broken(robot, frames, &rig, LEG_US, broken)
-                        })
-                    } else {
-                        rosbot(&ROSBOT, &rig, RosbotSettings::default(), |robot, frames| {
-                            with_broken(robot, frames, &rig, ROSBOT_US, broken)
-                        })
-                    };
-                    // Some failed when the tick ended, or never were called as often.
-                    let Some((before, after, alarms)) = outcome else { continue };
-                    assert!(alarms.contains(Alarms::ACTUATOR), "{broken:?}: {alarms}");
-                    let expected = if before == Mode::Running { Mode::Safe } else { before };
-                    assert_eq!(after, expected, "{broken:?}");
-                    counts[usize::from(before == Mode::Running)] += 1;
-                }
-            }
+        let cases = devices.flat_map(|device| (1..40).map(move |call| (device, call)));
+        let ways = [(false, false), (false, true), (true, false), (true, true)];
+        for ((device, call), (forever, does_it)) in
+            cases.flat_map(|case| ways.map(|way| (case, way)))
+        {
+            let broken = Broken { device, call, forever, does_it };
+            let rig = Rig::new(is_leg);
+            rig.0.borrow_mut().broken = Some(broken);
+            let outcome = if is_leg {
+                let settings = SoftLegSettings { ticks_per_sample, ..LEG_SETTINGS };
+                leg(&PLAIN, &rig, settings, |robot, frames| {
+                    let period_us = LEG_US / u64::from(ticks_per_sample);
+                    with_broken(robot, frames, &rig, period_us, broken)
+                })
+            } else {
+                rosbot(&ROSBOT, &rig, RosbotSettings::default(), |robot, frames| {
+                    with_broken(robot, frames, &rig, ROSBOT_US, broken)
+                })
+            };
+            // Some failed when the tick ended, or never were called as often.
+            let Some((before, after, alarms)) = outcome else { continue };
+            assert!(alarms.contains(Alarms::ACTUATOR), "{broken:?}: {alarms}");
+            let expected = if before == Mode::Running { Mode::Safe } else { before };
+            assert_eq!(after, expected, "{broken:?}");
+            counts[usize::from(before == Mode::Running)] += 1;
         }
     }
     println!("failures in idle and in running ticks: {counts:?}");
@@ -998,6 +1001,171 @@ fn frames_are_numbered_and_dropped_ones_counted() {
         assert_eq!((frame.noticed, frame.alarms), (Alarms::none(), Alarms::BAD_COMMAND));
         assert_eq!(frame.time_us, now_us - LEG_US);
     });
+}
+
+// A leg with several ticks per sample
+
+/// Of 2 ms, the usual ones, for a leg that runs, from the tick after a sample on.
+fn ticking_leg<T>(
+    test: impl FnOnce(&mut dyn ControlLoop<2>, &mut Frames<'_>, &Rig, u64) -> T,
+) -> T {
+    let rig = Rig::new(true);
+    leg(&PLAIN_BOUNDED, &rig.clone(), SoftLegSettings::default(), |robot, frames| {
+        let mut now_us = 0;
+        run(robot, &mut now_us, TICK_US, 1);
+        robot.command(Command::Start);
+        run(robot, &mut now_us, TICK_US, 25);
+        while frames.dequeue().is_some() {}
+        test(robot, frames, &rig, now_us)
+    })
+}
+
+const TICK_US: u64 = LEG_US / 25;
+
+/// Duties of voltages.
+fn duties(volts: [f32; 2]) -> [u16; 2] {
+    volts.map(|u| (u.abs() / 12.0 * f32::from(MAX_DUTY) + 0.5) as u16)
+}
+
+#[test]
+fn inputs_of_a_leg_are_constant_from_sample_to_sample() {
+    for ticks_per_sample in [1_u8, 2, 25, 255] {
+        let rig = Rig::new(true);
+        let settings = SoftLegSettings { ticks_per_sample, ..LEG_SETTINGS };
+        leg(&PLAIN, &rig.clone(), settings, |robot, frames| {
+            let period_us = LEG_US / u64::from(ticks_per_sample);
+            let ticks = u32::from(ticks_per_sample);
+            let mut now_us = 0;
+            let mut acts = [0.0; 2];
+            for tick in 0..4 * ticks {
+                // Fifths and sevenths are no floats.
+                let u = [tick as f32 / 5.0 % 9.0, -1.0 - tick as f32 / 7.0 % 5.0];
+                if tick == 1 {
+                    robot.command(Command::Start);
+                }
+                robot.command(Command::Inputs(u));
+                run(robot, &mut now_us, period_us, 1);
+                if tick % ticks == 0 {
+                    let acted = std::mem::replace(&mut acts, if tick > 0 { u } else { [0.0; 2] });
+                    let frame = frames.dequeue().expect("a sample");
+                    assert_eq!(frame.applied, acted, "tick {tick} of {ticks}");
+                    assert_eq!(frame.time_us, now_us - period_us);
+                }
+                assert!(frames.dequeue().is_none());
+                assert_eq!(rig.0.borrow().duty, duties(acts), "tick {tick} of {ticks}");
+            }
+            // Every tick sets them anew.
+            assert!(rig.0.borrow().calls[PWM] >= 4 * ticks);
+            assert_eq!((robot.mode(), rig.misuse()), (Mode::Running, vec![]));
+        });
+    }
+}
+
+#[test]
+fn a_leg_is_switched_off_at_the_tick_and_predicted_with_what_acted() {
+    type Break = fn(&mut dyn ControlLoop<2>, &mut u64);
+    let breaks: [(Break, Mode); 3] = [
+        (|robot, _| robot.command(Command::Stop), Mode::Idle),
+        // A tick that is lost.
+        (|_, now_us| *now_us += TICK_US, Mode::Safe),
+        // One that takes too long; what it began it has not done.
+        (
+            |robot, now_us| {
+                robot.tick(*now_us);
+                robot.finish(*now_us + TICK_US + 1);
+                *now_us += TICK_US;
+            },
+            Mode::Safe,
+        ),
+    ];
+    for (broken, (break_it, mode)) in breaks.into_iter().enumerate() {
+        for after in [1, 10, 23] {
+            ticking_leg(|robot, frames, rig, mut now_us| {
+                robot.command(Command::Inputs([6.0, -3.0]));
+                // Until the next sample, which is the first of them, they do not act.
+                run(robot, &mut now_us, TICK_US, 24);
+                assert!(rig.is_off() && frames.dequeue().is_none());
+                run(robot, &mut now_us, TICK_US, after);
+                assert_eq!(rig.0.borrow().duty, duties([6.0, -3.0]));
+                assert_eq!(frames.dequeue().unwrap().applied, [0.0; 2]);
+                break_it(robot, &mut now_us);
+                let over = usize::from(broken == 2);
+                run(robot, &mut now_us, TICK_US, 1);
+                assert_eq!((robot.mode(), rig.is_off()), (mode, true));
+                run(robot, &mut now_us, TICK_US, 25 - over - after);
+                let frame = frames.dequeue().unwrap();
+                for (applied, u) in frame.applied.iter().zip([6.0, -3.0]) {
+                    assert!((applied - u * after as f32 / 25.0).abs() < 1e-5, "{applied}");
+                }
+                assert_eq!(frame.mode, mode);
+            });
+        }
+    }
+}
+
+#[test]
+fn a_leg_that_starts_between_two_samples_waits_for_the_next() {
+    ticking_leg(|robot, frames, rig, mut now_us| {
+        let inputs = Command::Inputs([6.0, 6.0]);
+        robot.command(inputs);
+        run(robot, &mut now_us, TICK_US, 30);
+        assert!(!rig.is_off());
+        // What acted before the stop does not go on.
+        for command in [Command::Stop, Command::Start, inputs] {
+            robot.command(command);
+        }
+        while frames.dequeue().is_some() {}
+        for tick in 30..49 {
+            run(robot, &mut now_us, TICK_US, 1);
+            assert_eq!((robot.mode(), rig.is_off()), (Mode::Running, true), "tick {tick}");
+        }
+        run(robot, &mut now_us, TICK_US, 1);
+        assert!(!rig.is_off() && rig.misuse().is_empty());
+        // Ticks 24 to 29.
+        let applied = frames.dequeue().unwrap().applied[0];
+        assert!((applied - 6.0 * 6.0 / 25.0).abs() < 1e-5, "{applied}");
+    });
+}
+
+#[test]
+fn a_leg_whose_host_is_silent_stops_at_the_tick() {
+    ticking_leg(|robot, _, rig, mut now_us| {
+        run(robot, &mut now_us, TICK_US, 7);
+        robot.command(Command::Inputs([6.0, 6.0]));
+        run(robot, &mut now_us, TICK_US, 500);
+        assert_eq!((robot.mode(), rig.is_off()), (Mode::Running, false));
+        run(robot, &mut now_us, TICK_US, 1);
+        assert!(robot.alarms().contains(Alarms::HOST_SILENT) && rig.is_off());
+        assert_eq!(robot.mode(), Mode::Safe);
+    });
+}
+
+#[test]
+fn no_ticks_are_no_sample() {
+    let rig = Rig::new(true);
+    let chamber = |i| Chamber::new(Duty(rig.clone(), i), Level(rig.clone(), i));
+    let pneumatics = Pneumatics {
+        bending: chamber(0),
+        extension: chamber(1),
+        input_pump: Level(rig.clone(), 2),
+        exhaust_pump: Level(rig.clone(), 3),
+    };
+    let settings = SoftLegSettings { ticks_per_sample: 0, ..LEG_SETTINGS };
+    let mut queue = Queue::<2>::new();
+    let telemetry = Telemetry::new(queue.split().0);
+    let refused =
+        SoftLeg::<_, _, 5>::new(&PLAIN, pneumatics, Eye(rig.clone()), settings, telemetry);
+    let field = "ticks_per_sample";
+    assert_eq!(refused.err(), Some(ControlLoopError::Setting { field }));
+
+    let motor = |i| Motor::new(Duty(rig.clone(), i), Level(rig.clone(), i));
+    let sides = Sides { right: motor(0), left: motor(1) };
+    let devices = (sides, (Count(rig.clone(), 0), Count(rig.clone(), 1)), Eye(rig.clone()));
+    let settings = RosbotSettings { ticks_per_sample: 0, ..RosbotSettings::default() };
+    let mut queue = Queue::<2>::new();
+    let telemetry = Telemetry::new(queue.split().0);
+    let refused = Rosbot::<_, _, _, 5>::new(&ROSBOT, devices, settings, telemetry);
+    assert_eq!(refused.err(), Some(ControlLoopError::Setting { field }));
 }
 
 // Whether the robot is as the model says

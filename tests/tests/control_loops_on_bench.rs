@@ -23,7 +23,7 @@ use trainer::robot::{Robot, ScoreOptions};
 use trainer::score;
 use trainer::trajectory::Logs;
 
-const LEG_US: u64 = 50_000;
+const LEG_US: u64 = 2_000;
 const ROSBOT_US: u64 = 10_000;
 
 fn folder(name: &str) -> std::path::PathBuf {
@@ -128,17 +128,14 @@ fn bend(model: &Model<'static>, (gaps, spike): (bool, f32), seconds: u64) -> Vec
     let sensor = Gappy { sensor: devices.tip, gaps, spike, samples: 0 };
     let mut queue = Queue::<4>::new();
     let (producer, mut consumer) = queue.split();
-    let (settings, telemetry) = (
-        SoftLegSettings { ticks_per_sample: 1, ..SoftLegSettings::default() },
-        Telemetry::new(producer),
-    );
+    let (settings, telemetry) = (SoftLegSettings::default(), Telemetry::new(producer));
     let mut robot = SoftLeg::<_, _, 5>::new(model, actuators, sensor, settings, telemetry).unwrap();
     let (mut frames, mut seed) = (Vec::new(), 1);
     for tick in 0..=seconds * 1_000_000 / LEG_US {
         if tick == 1 {
             robot.command(Command::Start);
         }
-        if tick % 10 == 1 {
+        if tick % 250 == 1 {
             robot.command(Command::Inputs([(); 2].map(|()| (uniform(&mut seed) * 12.0) as f32)));
         }
         let mode = robot.tick(bench.clock().now_us());

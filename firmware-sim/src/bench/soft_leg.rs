@@ -25,6 +25,8 @@ pub const SUPPLY_VOLT: f64 = 12.0;
 /// Longest step of the plant (ns): four of them in 50 ms keep the error of RK4 below a fifth of the
 /// sensor's noise; two would come up to it.
 const STEP_NS: u64 = 12_500_000;
+/// A valve that sticks with some probability does so, or does not, for so long (µs).
+const STICKS_US: u64 = 50_000;
 const TIMER: u8 = 3;
 const LINE_PINS: [&str; 2] = ["line_bending", "line_extension"];
 const PUMP_PINS: [&str; 2] = ["pump_input", "pump_exhaust"];
@@ -49,6 +51,17 @@ pub enum StuckValve {
     AsItIs,
     /// It is open this far, from 0 to 1, to whatever line is selected.
     At(f64),
+}
+
+/// What acts on the plant: outputs and faults.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Acting {
+    volts: [f64; 2],
+    pressure: [bool; 2],
+    pumps: [bool; 2],
+    stuck: [Option<StuckValve>; 2],
+    leaks: [f64; 2],
+    pump_strength: [f64; 2],
 }
 
 /// A soft leg, idle, on its board.
@@ -81,8 +94,11 @@ pub struct SoftLegBench {
     plant: SoftLeg,
     board: Board,
     clock: VirtualClock,
-    /// How far the plant has come (ns).
+    /// How far the plant has come (ns), and what has acted on it since.
     plant_ns: u64,
+    acting: Acting,
+    /// When it is drawn next whether valves stick (µs).
+    draw_us: u64,
     valves: [Wire<f64>; 2],
     pressure: [Wire<bool>; 2],
     pumps: [Wire<bool>; 2],
@@ -106,6 +122,15 @@ impl SoftLegBench {
             sag: 0.0,
             plant,
             plant_ns: 0,
+            acting: Acting {
+                volts: [0.0; 2],
+                pressure: [false; 2],
+                pumps: [false; 2],
+                stuck: [None; 2],
+                leaks: [1.0; 2],
+                pump_strength: [1.0; 2],
+            },
+            draw_us: 0,
             valves: [1, 2].map(|channel| board.pwm_wire(TIMER, channel)),
             pressure: LINE_PINS.map(|pin| board.pin_wire(pin)),
             pumps: PUMP_PINS.map(|pin| board.pin_wire(pin)),
@@ -176,9 +201,20 @@ impl SoftLegBench {
 
     /// Sets valves, leaks, pumps and sag to what the faults say now; call it once per tick.
     pub fn apply(&mut self, faults: &Faults) {
+        let now_us = self.clock.now_ns() / 1000;
+        let draws = now_us >= self.draw_us;
+        if draws {
+            self.draw_us = (now_us / STICKS_US + 1).saturating_mul(STICKS_US);
+        }
         for unit in 0..2 {
             let act = |kind| faults.act(kind, Some(unit));
-            self.stuck[unit] = if faults.strikes(FaultKind::StuckValve, Some(unit)) {
+            let sticks = if draws {
+                faults.strikes(FaultKind::StuckValve, Some(unit))
+            } else {
+                self.stuck[unit] == Some(StuckValve::AsItIs)
+                    && faults.is_active(FaultKind::StuckValve, Some(unit))
+            };
+            self.stuck[unit] = if sticks {
                 Some(StuckValve::AsItIs)
             } else {
                 act(FaultKind::OpenValve).map(StuckValve::At)
@@ -191,26 +227,58 @@ impl SoftLegBench {
 
     /// Lets `us` microseconds pass, and the plant catch up with the clock, under held outputs.
     pub fn advance_us(&mut self, us: u64) {
+        self.pass_us(us);
+        self.catch_up();
+    }
+
+    /// Lets `us` microseconds pass under held outputs. The plant waits: sensors and whoever looks at it see
+    /// it where it was when it caught up last.
+    pub fn pass_us(&mut self, us: u64) {
+        self.notice();
         self.clock.advance_us(us);
+    }
+
+    /// The plant catches up with the clock, in as few steps as can be: however often time passed under the
+    /// same outputs, it comes to the same.
+    pub fn catch_up(&mut self) {
         let now_ns = self.clock.now_ns();
-        let (volts, at) = (self.volts(), self.plant.openings());
+        if self.plant_ns == now_ns {
+            return;
+        }
+        let Acting { volts, pressure, pumps, stuck, leaks, pump_strength } = self.acting;
+        let at = self.plant.openings();
         let openings = std::array::from_fn(|chamber| {
-            let line = if self.pressure[chamber].get() { 1.0 } else { -1.0 };
-            match self.stuck[chamber] {
+            let line = if pressure[chamber] { 1.0 } else { -1.0 };
+            match stuck[chamber] {
                 None => self.plant.opening(volts[chamber]),
                 Some(StuckValve::AsItIs) => at[chamber],
                 Some(StuckValve::At(opening)) => opening * line,
             }
         });
-        let sources =
-            std::array::from_fn(|pump| self.pumps[pump].get().then_some(self.pump_strength[pump]));
-        let around = Surroundings { sources, leaks: self.leaks };
+        let sources = std::array::from_fn(|pump| pumps[pump].then_some(pump_strength[pump]));
+        let around = Surroundings { sources, leaks };
         while self.plant_ns < now_ns {
             let step_ns = (now_ns - self.plant_ns).min(STEP_NS);
             self.plant.step_towards(openings, &around, step_ns as f64 * 1e-9);
             self.plant_ns += step_ns;
         }
         self.tip.set(self.plant.observe());
+    }
+
+    /// What has been set acts from now on; up to now it was what acted before.
+    fn notice(&mut self) {
+        let acting = Acting {
+            volts: self.volts(),
+            pressure: self.pressure.each_ref().map(Wire::get),
+            pumps: self.pumps.each_ref().map(Wire::get),
+            stuck: self.stuck,
+            leaks: self.leaks,
+            pump_strength: self.pump_strength,
+        };
+        if acting != self.acting {
+            self.catch_up();
+            self.acting = acting;
+        }
     }
 }
 
@@ -352,6 +420,54 @@ mod tests {
         bench.apply(&faults);
         assert_eq!((bench.stuck, bench.leaks), ([None; 2], [1.0; 2]));
         assert_eq!((bench.pump_strength, bench.sag), ([1.0; 2], 0.0));
+    }
+
+    #[test]
+    fn it_comes_to_the_same_however_often_time_passes() {
+        let mut legs = [running(), running()];
+        let mut ends = [[0.0; 2]; 2];
+        for (step_us, ((bench, devices), end)) in
+            [50_000, 2_000].into_iter().zip(legs.iter_mut().zip(&mut ends))
+        {
+            for sample in 0..40_u16 {
+                // Held, changed, and closed in the middle of a sample.
+                devices.valves[0].set_duty_cycle(sample / 3 * 300).unwrap();
+                devices.lines[0].set_state((sample % 6 < 3).into()).unwrap();
+                for part_us in [20_000, 30_000] {
+                    for _ in 0..part_us / step_us.min(part_us) {
+                        bench.pass_us(step_us.min(part_us));
+                    }
+                    if sample % 7 == 0 {
+                        devices.valves[0].set_duty_cycle(0).unwrap();
+                    }
+                }
+                bench.catch_up();
+            }
+            *end = bench.tip_mm();
+        }
+        assert_eq!(ends[0], ends[1]);
+        assert!(ends[0][0].abs() > 1.0, "{ends:?}");
+    }
+
+    #[test]
+    fn a_valve_sticks_or_not_for_a_while_and_no_longer_than_its_fault() {
+        let (mut bench, _) = bench();
+        let faults = ["stuck-valve:0@0..10=0.5", "stuck-valve:1@0..0.01=1"];
+        let faults = Faults::new(bench.clock(), faults.map(|text| text.parse().unwrap()), 1);
+        let (mut changes, mut last) = (0, None);
+        for tick in 0..5_000 {
+            bench.apply(&faults);
+            if bench.stuck[0] != last {
+                assert_eq!(tick % 25, 0);
+                (changes, last) = (changes + 1, bench.stuck[0]);
+            }
+            assert_eq!(bench.stuck[1].is_some(), tick < 5);
+            bench.advance_us(2_000);
+        }
+        // Two hundred draws; four standard deviations of half of them.
+        assert!((70..130).contains(&changes), "{changes}");
+        let times = faults.injections().map(|(_, times)| times).collect::<Vec<_>>();
+        assert!((72..128).contains(&times[0]) && times[1] == 1, "{times:?}");
     }
 
     #[test]

@@ -37,7 +37,10 @@ use std::time::{Duration, Instant};
 const PATIENCE: Duration = Duration::from_millis(100);
 /// The same where somebody else has bytes, too.
 const SHORT: Duration = Duration::from_millis(1);
-/// Most ticks that a robot moves at once when frames were lost: a second of the ROSbot.
+/// Time between two ticks (µs), also of the leg, whose loop could tick faster: frames go to the robot and back
+/// in between.
+const TICK_US: u64 = 10_000;
+/// Most ticks that a robot moves at once when frames were lost: a second.
 const MOST_TICKS: u32 = 100;
 
 /// A line to a controller.
@@ -137,14 +140,8 @@ struct SoftLeg {
 }
 
 /// A sensor measures every tick: which of them are samples the controller knows.
-fn every_tick<const N: usize>(
-    settings: MotionCaptureSettings<N>,
-    tick_us: u64,
-) -> MotionCaptureSettings<N> {
-    MotionCaptureSettings {
-        period_us: NonZeroU64::new(tick_us).unwrap_or(NonZeroU64::MIN),
-        ..settings
-    }
+fn every_tick<const N: usize>(settings: MotionCaptureSettings<N>) -> MotionCaptureSettings<N> {
+    MotionCaptureSettings { period_us: NonZeroU64::new(TICK_US).unwrap(), ..settings }
 }
 
 /// A duty as the controller says it, on a channel of ours, which has the same full duty.
@@ -180,7 +177,7 @@ impl Devices for Rosbot {
 
     fn hold(&mut self) {
         self.bench.apply(&self.faults);
-        self.bench.advance_us(RosbotBench::TICK_US);
+        self.bench.advance_us(TICK_US);
     }
 
     fn sense(&mut self) -> ([u16; 2], Option<([f32; 3], u32)>) {
@@ -206,7 +203,7 @@ impl Devices for SoftLeg {
 
     fn hold(&mut self) {
         self.bench.apply(&self.faults);
-        self.bench.advance_us(SoftLegBench::TICK_US);
+        self.bench.advance_us(TICK_US);
     }
 
     fn sense(&mut self) -> ([u16; 2], Option<([f32; 3], u32)>) {
@@ -242,7 +239,7 @@ impl Plant {
             Robot::Rosbot => {
                 let mut bench = <RosbotBench as Rig<3>>::new();
                 let faults = Faults::new(bench.clock(), faults, seed);
-                let settings = every_tick(MotionCaptureSettings::POSE, RosbotBench::TICK_US);
+                let settings = every_tick(MotionCaptureSettings::POSE);
                 let devices = bench.devices(settings, seed).expect(CLAIMED);
                 let [right, left] = devices.encoders;
                 Box::new(Rosbot {
@@ -260,7 +257,7 @@ impl Plant {
             Robot::SoftLeg => {
                 let mut bench = <SoftLegBench as Rig<2>>::new();
                 let faults = Faults::new(bench.clock(), faults, seed);
-                let settings = every_tick(MotionCaptureSettings::TIP, SoftLegBench::TICK_US);
+                let settings = every_tick(MotionCaptureSettings::TIP);
                 let devices = bench.devices(settings, seed).expect(CLAIMED);
                 Box::new(SoftLeg {
                     valves: devices.valves,
@@ -427,14 +424,13 @@ impl LinkEnd {
 /// When the link is gone.
 pub fn pass_on(
     mut link: Line,
-    robot: Robot,
     (scenario, seed): (&Scenario, u64),
     door: Door,
     drives: bool,
 ) -> io::Result<Infallible> {
     link.set_patience(SHORT)?;
     let end = LinkEnd { line: link, bytes: [0; 256], waiting: 0..0, error: None };
-    let host = Host::new(scenario, robot.run().tick_us(), seed);
+    let host = Host::new(scenario, seed);
     // Waiting for the link's bytes is what paces it.
     let mut remote = Remote::new(end, door, host, (drives, 0.0));
     let began = Instant::now();

@@ -79,11 +79,10 @@ pub(crate) struct Host {
 }
 
 impl Host {
-    pub(crate) fn new(scenario: &Scenario, tick_us: u64, seed: u64) -> Self {
-        let period_us = COMMAND_US.max(tick_us);
+    pub(crate) fn new(scenario: &Scenario, seed: u64) -> Self {
         Self {
             receiver: Receiver::new(),
-            script: Script::new(scenario, period_us as f64 * 1e-6, seed),
+            script: Script::new(scenario, COMMAND_US as f64 * 1e-6, seed),
             restart: scenario.restart,
             mode: Mode::Idle,
             due_us: 0,

@@ -36,11 +36,12 @@ pub(crate) trait Rig<const N: usize> {
         telemetry: Telemetry<'q>,
     ) -> Result<impl ControlLoop<2> + use<'m, 'q, Self, N>, ControlLoopError>;
     fn apply(&mut self, faults: &Faults);
+    /// Lets time pass under held outputs.
     fn advance_us(&mut self, us: u64);
     fn board(&mut self) -> &mut Board;
     fn clock(&self) -> VirtualClock;
-    /// The true coordinates.
-    fn truth(&self) -> [f64; N];
+    /// The true coordinates, which the position sensor has only now, too.
+    fn truth(&mut self) -> [f64; N];
     /// Whether nothing is driven.
     fn is_off(&self) -> bool;
 }
@@ -91,7 +92,7 @@ impl Rig<3> for RosbotBench {
     fn clock(&self) -> VirtualClock {
         self.clock().clone()
     }
-    fn truth(&self) -> [f64; 3] {
+    fn truth(&mut self) -> [f64; 3] {
         self.motion().pose
     }
     fn is_off(&self) -> bool {
@@ -100,8 +101,8 @@ impl Rig<3> for RosbotBench {
 }
 
 impl Rig<2> for SoftLegBench {
-    const TICK_US: u64 = 50_000;
-    const TICKS_PER_SAMPLE: u64 = 1;
+    const TICK_US: u64 = 2_000;
+    const TICKS_PER_SAMPLE: u64 = 25;
     const AHEAD: usize = 20;
     /// mm.
     const SPIKE: [f32; 2] = [30.0, 30.0];
@@ -130,7 +131,7 @@ impl Rig<2> for SoftLegBench {
             exhaust_pump,
         };
         let tip = FaultySensor::new(devices.tip, faults, Self::SPIKE);
-        let settings = SoftLegSettings { ticks_per_sample: 1, ..SoftLegSettings::default() };
+        let settings = SoftLegSettings::default();
         SoftLeg::<_, _, { Self::AHEAD }>::new(model, pneumatics, tip, settings, telemetry)
     }
 
@@ -138,7 +139,8 @@ impl Rig<2> for SoftLegBench {
         self.apply(faults);
     }
     fn advance_us(&mut self, us: u64) {
-        self.advance_us(us);
+        // A leg has nothing that is measured between two samples.
+        self.pass_us(us);
     }
     fn board(&mut self) -> &mut Board {
         self.board()
@@ -146,7 +148,8 @@ impl Rig<2> for SoftLegBench {
     fn clock(&self) -> VirtualClock {
         self.clock().clone()
     }
-    fn truth(&self) -> [f64; 2] {
+    fn truth(&mut self) -> [f64; 2] {
+        self.catch_up();
         self.tip_mm()
     }
     fn is_off(&self) -> bool {

@@ -60,6 +60,8 @@ const QUEUE: usize = 8;
 const GOOD_US: u32 = 10_000_000;
 /// Answers wait at most so long for the line before a reset (µs).
 const RESET_US: u64 = 1_000_000;
+/// Time between two ticks of the leg (µs), that of [`plant_line`].
+const LEG_US: u32 = 10_000;
 /// Time from one report to the next (µs).
 const REPORT_US: u64 = 10_000_000;
 
@@ -145,9 +147,10 @@ fn rosbot(controller: Controller) -> Option<()> {
 
 #[inline(never)]
 fn leg(controller: Controller) -> Option<()> {
-    let capacities =
-        Capacities::new::<2, 2>(50_000, instructions(50_000, most_steps(1, 20) as u32));
-    let of = Of { name: "soft-leg", factory: &LEG.0, capacities, period_us: 50_000 };
+    let ticks_per_sample = (50_000 / LEG_US) as u8;
+    let steps = most_steps(ticks_per_sample, 20) as u32;
+    let capacities = Capacities::new::<2, 2>(50_000, instructions(LEG_US, steps));
+    let of = Of { name: "soft-leg", factory: &LEG.0, capacities, period_us: LEG_US };
     let Controller { clock, link, line, key } = controller;
     let Booted { mut updater, blob } = boot(&of, key)?;
     let model = firmware_core::parse_for(of.name, blob).ok()?;
@@ -160,10 +163,8 @@ fn leg(controller: Controller) -> Option<()> {
     };
     let mut queue = Queue::<QUEUE>::new();
     let (producer, mut frames) = queue.split();
-    let (settings, telemetry) = (
-        SoftLegSettings { ticks_per_sample: 1, ..SoftLegSettings::default() },
-        Telemetry::new(producer),
-    );
+    let settings = SoftLegSettings { ticks_per_sample, ..SoftLegSettings::default() };
+    let telemetry = Telemetry::new(producer);
     let tip = plant.position();
     let mut robot = SoftLeg::<_, _, 20>::new(&model, pneumatics, tip, settings, telemetry).ok()?;
     run(&of, &mut robot, &mut updater, &mut frames, &plant, (clock, link))
