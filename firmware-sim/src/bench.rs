@@ -8,8 +8,8 @@
 //! ```
 //!
 //! A tick of the firmware takes no time; between ticks the bench advances, with the outputs held.
-//! Whoever lets the clock run on his own, as erasing flash does, advances the bench by 0 before he
-//! touches an output or a sensor again: the plant then catches up.
+//! Whoever lets the clock run on his own, as erasing flash does, advances the bench by 0 before that, if he
+//! has touched an output, and before he touches an output or a sensor again: the plant then catches up.
 
 pub mod rosbot;
 pub mod soft_leg;

@@ -65,8 +65,9 @@ pub struct RosbotBench {
     plant: SkidSteer,
     board: Board,
     clock: VirtualClock,
-    /// How far the plant has come (ns).
+    /// How far the plant has come (ns), and the voltages and slip that have acted on it since.
     plant_ns: u64,
+    acting: [[f64; 2]; 2],
     pwm: [Wire<f64>; 2],
     backwards: [Wire<bool>; 2],
     angle_rad: [Wire<f64>; 2],
@@ -88,6 +89,7 @@ impl RosbotBench {
             sag: 0.0,
             plant,
             plant_ns: 0,
+            acting: [[0.0; 2]; 2],
             pwm: [1, 2].map(|channel| board.pwm_wire(TIMER, channel)),
             backwards: DIRECTION_PINS.map(|pin| board.pin_wire(pin)),
             angle_rad: Default::default(),
@@ -158,12 +160,30 @@ impl RosbotBench {
 
     /// Lets `us` microseconds pass, and the plant catch up with the clock, under held outputs.
     pub fn advance_us(&mut self, us: u64) {
+        self.pass_us(us);
+        self.catch_up();
+    }
+
+    /// Lets `us` microseconds pass under held outputs. The plant waits: encoders, sensors and whoever looks at
+    /// it see it where it was when it caught up last.
+    pub fn pass_us(&mut self, us: u64) {
+        // What has been set acts from now on; up to now it was what acted before.
+        let acting = [self.volts(), self.slip];
+        if acting != self.acting {
+            self.catch_up();
+            self.acting = acting;
+        }
         self.clock.advance_us(us);
+    }
+
+    /// The plant catches up with the clock, in as few steps as can be: however often time passed under the
+    /// same outputs, it comes to the same.
+    pub fn catch_up(&mut self) {
         let now_ns = self.clock.now_ns();
-        let volts = self.volts();
+        let [volts, slip] = self.acting;
         while self.plant_ns < now_ns {
             let step_ns = (now_ns - self.plant_ns).min(STEP_NS);
-            self.plant.step(volts, self.slip, step_ns as f64 * 1e-9);
+            self.plant.step(volts, slip, step_ns as f64 * 1e-9);
             self.plant_ns += step_ns;
         }
         let motion = self.plant.motion();
@@ -272,11 +292,27 @@ mod tests {
     }
 
     #[test]
+    fn it_comes_to_the_same_however_often_time_passes() {
+        let (mut bench, mut devices) = bench();
+        let (mut other, mut others) = self::bench();
+        for tick in 0..100_u16 {
+            devices.pwm[0].set_duty_cycle(tick * 40).unwrap();
+            others.pwm[0].set_duty_cycle(tick * 40).unwrap();
+            bench.advance_us(10_000);
+            [17, 983, 9_000].into_iter().for_each(|us| other.pass_us(us));
+            other.catch_up();
+            assert_eq!(bench.motion(), other.motion());
+        }
+        assert!(bench.motion().pose[2] > 0.1);
+    }
+
+    #[test]
     fn catches_up_with_a_clock_that_ran_on() {
         let (mut bench, mut devices) = bench();
         let (mut other, mut others) = self::bench();
         devices.pwm[0].set_duty_cycle_fully_on().unwrap();
         others.pwm[0].set_duty_cycle_fully_on().unwrap();
+        bench.advance_us(0);
         bench.clock().advance_us(1_000_000);
         bench.advance_us(0);
         advance(&mut other, 100);

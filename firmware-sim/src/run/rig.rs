@@ -81,10 +81,12 @@ impl Rig<3> for RosbotBench {
     }
 
     fn apply(&mut self, faults: &Faults) {
+        // Wheels are counted at every tick.
+        self.catch_up();
         self.apply(faults);
     }
     fn advance_us(&mut self, us: u64) {
-        self.advance_us(us);
+        self.pass_us(us);
     }
     fn board(&mut self) -> &mut Board {
         self.board()
