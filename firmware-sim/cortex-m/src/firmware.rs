@@ -212,7 +212,7 @@ pub fn leg_loop<'m, 'q>(
         exhaust_pump: Nowhere,
     };
     let settings = SoftLegSettings::default();
-    let tip = Turning { last: 0.0, by: 0.0 };
+    let tip = Turning { last: 60.0, by: 0.0 };
     SoftLeg::<_, _, 20>::new(model, pneumatics, tip, settings, telemetry).ok()
 }
 

@@ -71,7 +71,7 @@ fn worst(
         if tick == 10 * per_sample {
             robot.command(Command::Start);
         }
-        robot.command(Command::Inputs(black_box([4.0, -4.0])));
+        robot.command(Command::Inputs(black_box([16.0, -16.0])));
         let taken = count(|| {
             black_box(robot.tick(black_box(now_us)));
             black_box(robot.finish(black_box(now_us + 1)));
