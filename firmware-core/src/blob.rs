@@ -92,38 +92,45 @@ pub(crate) const Q31_SELF_TEST: (u16, u16) = (0x0003, 7);
 const RANGES: (u16, u16) = (0x8001, 3);
 const ERROR_BOUNDS: (u16, u16) = (0x8002, 5);
 
-/// What a byte does to the CRC-32 (ISO-HDLC: polynomial 0x04C11DB7, reflected).
-static BYTES: [u32; 256] = {
-    let mut bytes = [0; 256];
-    let mut rest: &mut [u32] = &mut bytes;
-    let mut byte = 0;
+/// Bits that are looked up at once in a checksum, and what they do to the CRC-32 (ISO-HDLC: polynomial
+/// 0x04C11DB7, reflected).
+const BITS: u32 = 6;
+static TABLE: [u32; 1 << BITS] = {
+    let mut table = [0; 1 << BITS];
+    let mut rest: &mut [u32] = &mut table;
+    let mut index = 0;
     while let Some((first, others)) = rest.split_first_mut() {
-        let (mut crc, mut bit) = (byte, 0);
-        while bit < 8 {
+        let (mut crc, mut bit) = (index, 0);
+        while bit < BITS {
             crc = (crc >> 1) ^ if crc & 1 == 1 { 0xEDB8_8320 } else { 0 };
             bit += 1;
         }
         *first = crc;
-        byte += 1;
+        index += 1;
         rest = others;
     }
-    bytes
+    table
 };
+
+/// A checksum when so many of its bits, at most [`BITS`], have been worked off.
+#[inline(always)]
+fn shift(crc: u32, bits: u32) -> u32 {
+    // Zeros in front of fewer bits change nothing. Never out of bounds: an index has BITS.
+    let index = (crc << BITS.wrapping_sub(bits)) as usize % TABLE.len();
+    (crc >> bits) ^ TABLE.get(index).copied().unwrap_or(0)
+}
 
 /// CRC-32 (ISO-HDLC) of bytes that follow others with the checksum `before`; that of nothing is 0.
 ///
-/// A word at a time: four instructions a byte on a Cortex-M, a quarter of them to fetch the bytes.
+/// A word at a time: six instructions a byte on a Cortex-M. A table of all bytes would save two of them and be
+/// a kilobyte of flash.
 pub(crate) fn crc32(before: u32, bytes: &[u8]) -> u32 {
-    let next = |crc: u32| {
-        let [index, ..] = crc.to_le_bytes();
-        // Never out of bounds: there are as many as bytes.
-        (crc >> 8) ^ BYTES.get(usize::from(index)).copied().unwrap_or(0)
-    };
     let (words, rest) = bytes.as_chunks::<4>();
-    let whole = words
-        .iter()
-        .fold(!before, |crc, word| next(next(next(next(crc ^ u32::from_le_bytes(*word))))));
-    !rest.iter().fold(whole, |crc, byte| next(crc ^ u32::from(*byte)))
+    let whole = words.iter().fold(!before, |crc, word| {
+        let next = |crc| shift(crc, BITS);
+        shift(next(next(next(next(next(crc ^ u32::from_le_bytes(*word)))))), 2)
+    });
+    !rest.iter().fold(whole, |crc, byte| shift(shift(crc ^ u32::from(*byte), BITS), 2))
 }
 
 /// Puts bytes at an address divisible by four, as a blob needs them.
@@ -266,17 +273,18 @@ impl<'a> SelfTest<'a> {
     /// Cuts the section's numbers into the parts that the model's shape asks for.
     fn split(structure: &Structure<'_>, numbers: &'a [f32]) -> Option<Self> {
         let (n, m) = (structure.states().len(), structure.inputs().len());
-        let samples = structure.lag().saturating_add(1);
-        let (states, rest) = numbers.split_at_checked(samples.saturating_mul(n))?;
-        let (inputs, rest) = rest.split_at_checked(samples.saturating_mul(m))?;
+        let samples = structure.lag().wrapping_add(1);
+        let (states, rest) = numbers.split_at_checked(samples.wrapping_mul(n))?;
+        let (inputs, rest) = rest.split_at_checked(samples.wrapping_mul(m))?;
         let (expected, tolerance) = rest.split_at_checked(n)?;
         (tolerance.len() == n).then_some(Self { states, inputs, expected, tolerance })
     }
 
     fn len(structure: &Structure<'_>) -> usize {
         let (n, m) = (structure.states().len(), structure.inputs().len());
-        let samples = structure.lag().saturating_add(1);
-        samples.saturating_mul(n.saturating_add(m)).saturating_add(n.saturating_mul(2))
+        // Of a checked structure they are small numbers: nothing wraps.
+        let samples = structure.lag().wrapping_add(1);
+        samples.wrapping_mul(n.wrapping_add(m)).wrapping_add(n.wrapping_mul(2))
     }
 
     /// What the model predicts from the stored samples, in `out`, shape `[states]`.
@@ -419,7 +427,13 @@ fn load<'a>(
         };
     }
     if loaded.is_ok() {
-        loaded = model.structure_mut().check();
+        loaded = model.structure_mut().check_spaces();
+    }
+    if loaded.is_ok() {
+        loaded = model.structure_mut().check_dictionary();
+    }
+    if loaded.is_ok() {
+        loaded = model.structure_mut().check_observables();
     }
     if loaded.is_ok() {
         model.structure_mut().lay_out();
@@ -448,26 +462,27 @@ fn load<'a>(
 /// Terms, once it is clear that the sections of all numbers can be read.
 #[inline(never)]
 fn take_terms<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
-    sections.required::<f32>(COEFFICIENTS)?;
-    sections.optional::<f32>(RANGES)?;
-    let terms = sections.optional(TERMS)?;
+    sections.check(COEFFICIENTS, size_of::<f32>(), true)?;
+    sections.check(RANGES, size_of::<f32>(), false)?;
+    sections.check(TERMS, size_of::<[u8; 2]>(), false)?;
+    let terms = sections.bytes(TERMS).map(|bytes| bytes.as_chunks().0);
     model.take_terms(terms).map_err(|error| ModelError::Sparse(error).into())
 }
 
 #[inline(never)]
 fn take_numbers<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
-    let (coefficients, ranges) = (sections.required(COEFFICIENTS)?, sections.optional(RANGES)?);
-    Ok(model.take_numbers(coefficients, ranges)?)
+    // They have been looked at with the terms.
+    let coefficients = sections.numbers(COEFFICIENTS).unwrap_or(&[]);
+    model.take_numbers(coefficients, sections.numbers(RANGES))
 }
 
 /// Error bounds, if there are any.
 #[inline(never)]
 fn take_error_bounds<'a>(sections: &Sections<'a>, model: &mut Model<'a>) -> Result<(), ParseError> {
-    if let Some(words) = sections.optional(ERROR_BOUNDS)? {
-        let bounds = error_bounds(model.structure().states().len(), words)?;
-        model.set_error_bounds(bounds)?;
-    }
-    Ok(())
+    sections.check(ERROR_BOUNDS, size_of::<u32>(), false)?;
+    let Some(words) = sections.words(ERROR_BOUNDS) else { return Ok(()) };
+    let bounds = error_bounds(model.structure().states().len(), words)?;
+    model.set_error_bounds(bounds)
 }
 
 /// Tries the stored prediction.
@@ -477,11 +492,12 @@ fn try_prediction(
     model: &Model<'_>,
     state: &mut PredictorState,
 ) -> Result<(), ParseError> {
-    let numbers = sections.required(SELF_TEST)?;
+    sections.check(SELF_TEST, size_of::<f32>(), true)?;
+    let numbers = sections.numbers(SELF_TEST).unwrap_or(&[]);
     let wrong = ParseError::SectionLength {
         kind: SELF_TEST.0,
-        expected: SelfTest::len(model.structure()).saturating_mul(4),
-        found: numbers.len().saturating_mul(4),
+        expected: SelfTest::len(model.structure()).wrapping_mul(4),
+        found: size_of_val(numbers),
     };
     let self_test = SelfTest::split(model.structure(), numbers).ok_or(wrong)?;
     match self_test.failure(model, state) {
@@ -540,7 +556,7 @@ pub(crate) fn read_structure<'a>(sections: &Sections<'a>) -> Result<Structure<'a
 /// As [`parse`].
 pub fn self_test(bytes: &[u8]) -> Result<SelfTest<'_>, ParseError> {
     let model = parse(bytes)?;
-    let numbers = Sections::new(bytes)?.required(SELF_TEST)?;
+    let numbers = Sections::new(bytes)?.numbers(SELF_TEST).unwrap_or(&[]);
     SelfTest::split(model.structure(), numbers)
         .ok_or(ParseError::MissingSection { kind: SELF_TEST.0 })
 }
@@ -615,12 +631,13 @@ impl<'a> Sections<'a> {
         if count > MAX_SECTIONS {
             return Err(bad);
         }
-        let mut end = HEADER.saturating_add(count.saturating_mul(ENTRY));
-        let (table, _) = blob.get(HEADER..end).ok_or(bad)?.as_chunks::<ENTRY>();
-        let kinds = || table.iter().map(|entry| read_u16(entry, 0));
+        let end = HEADER.wrapping_add(count.wrapping_mul(ENTRY));
+        let (head, mut rest) = blob.split_at_checked(end).ok_or(bad)?;
+        let (table, _) = head.get(HEADER..).ok_or(bad)?.as_chunks::<ENTRY>();
         for (i, entry) in table.iter().enumerate() {
             let (kind, encoding) = (read_u16(entry, 0), read_u16(entry, 2));
-            if kinds().take(i).any(|earlier| earlier == kind) {
+            let earlier = table.get(..i).unwrap_or(&[]);
+            if earlier.iter().any(|entry| read_u16(entry, 0) == kind) {
                 return Err(bad);
             }
             if kind < OPTIONAL && !known.contains(&(kind, encoding)) {
@@ -634,70 +651,76 @@ impl<'a> Sections<'a> {
             // Every byte of a blob belongs to one section or is padding of zeros.
             let (offset, length) = (read_u32(entry, 4), read_u32(entry, 8));
             let length = usize::try_from(length).unwrap_or(usize::MAX);
-            let padded = end.saturating_add(length).checked_next_multiple_of(4).ok_or(bad)?;
-            let padding = blob.get(end.saturating_add(length)..padded).ok_or(bad)?;
+            let end = blob.len().wrapping_sub(rest.len());
+            let (_, behind) = rest.split_at_checked(length).ok_or(bad)?;
+            let padding = length.wrapping_neg() % 4;
+            let (padding, behind) = behind.split_at_checked(padding).ok_or(bad)?;
             if usize::try_from(offset) != Ok(end) || padding.iter().any(|byte| *byte != 0) {
                 return Err(bad);
             }
-            end = padded;
+            rest = behind;
         }
-        if end == blob.len() { Ok(Self { blob, table }) } else { Err(bad) }
+        if rest.is_empty() { Ok(Self { blob, table }) } else { Err(bad) }
     }
 
     /// The bytes of a section; one of another encoding counts as missing.
     #[inline(never)]
     pub(crate) fn bytes(&self, (kind, encoding): (u16, u16)) -> Option<&'a [u8]> {
-        let mut table = self.table.iter();
-        let entry = table.find(|e| (read_u16(*e, 0), read_u16(*e, 2)) == (kind, encoding))?;
+        // Both at once, as they lie there.
+        let beginning = u32::from(kind) | u32::from(encoding) << 16;
+        let entry = self.table.iter().find(|entry| read_u32(*entry, 0) == beginning)?;
         let offset = usize::try_from(read_u32(entry, 4)).unwrap_or(usize::MAX);
         let length = usize::try_from(read_u32(entry, 8)).unwrap_or(usize::MAX);
-        self.blob.get(offset..offset.saturating_add(length))
+        self.blob.get(offset..)?.get(..length)
     }
 
-    /// A section as whole elements, in place, if there is one.
-    #[inline]
-    fn optional<T: bytemuck::AnyBitPattern>(
-        &self,
-        section: (u16, u16),
-    ) -> Result<Option<&'a [T]>, ParseError> {
-        self.bytes(section).map(|bytes| elements(section.0, bytes)).transpose()
-    }
-
-    /// A section that has to be there.
-    #[inline]
-    pub(crate) fn required<T: bytemuck::AnyBitPattern>(
-        &self,
-        section: (u16, u16),
-    ) -> Result<&'a [T], ParseError> {
-        match self.bytes(section) {
-            Some(bytes) => elements(section.0, bytes),
-            None => Err(ParseError::MissingSection { kind: section.0 }),
+    /// Whether a section is there, or need not be, and has whole elements of so many bytes.
+    #[inline(never)]
+    fn check(&self, section: (u16, u16), size: usize, required: bool) -> Result<(), ParseError> {
+        let (kind, _) = section;
+        match self.bytes(section).map(<[u8]>::len) {
+            Some(found) if !found.is_multiple_of(size) => {
+                let expected = found.next_multiple_of(size);
+                Err(ParseError::SectionLength { kind, expected, found })
+            }
+            None if required => Err(ParseError::MissingSection { kind }),
+            _ => Ok(()),
         }
     }
-}
 
-/// The bytes of a section as whole elements, in place.
-#[inline]
-fn elements<T: bytemuck::AnyBitPattern>(kind: u16, bytes: &[u8]) -> Result<&[T], ParseError> {
-    let (expected, found) = (bytes.len().next_multiple_of(size_of::<T>()), bytes.len());
-    let wrong = |_| ParseError::SectionLength { kind, expected, found };
-    bytemuck::try_cast_slice(bytes).map_err(wrong)
+    /// A section of whole words, in place, if there is one.
+    #[inline(never)]
+    fn words(&self, section: (u16, u16)) -> Option<&'a [u32]> {
+        bytemuck::try_cast_slice(self.bytes(section)?).ok()
+    }
+
+    /// The same as numbers.
+    #[inline(always)]
+    fn numbers(&self, section: (u16, u16)) -> Option<&'a [f32]> {
+        bytemuck::try_cast_slice(self.words(section)?).ok()
+    }
+
+    /// A section of words that has to be there.
+    #[inline]
+    pub(crate) fn required(&self, section: (u16, u16)) -> Result<&'a [u32], ParseError> {
+        self.check(section, size_of::<u32>(), true)?;
+        Ok(self.words(section).unwrap_or(&[]))
+    }
 }
 
 /// Cuts the section of the error bounds into its parts.
 fn error_bounds(states: usize, words: &[u32]) -> Result<ErrorBounds<'_>, ParseError> {
-    let per_horizon = states.saturating_add(1);
-    let count = words.get(2).map_or(0, |h| usize::try_from(*h).unwrap_or(usize::MAX));
-    let length = ParseError::SectionLength {
-        kind: ERROR_BOUNDS.0,
-        expected: count.saturating_mul(per_horizon).saturating_add(3).saturating_mul(4),
-        found: words.len().saturating_mul(4),
-    };
-    let ([coverage, units, _], rest) = words.split_first_chunk().ok_or(length)?;
-    let (horizons, bounds) = rest.split_at_checked(count).ok_or(length)?;
-    if bounds.len() != count.saturating_mul(states) {
+    let found = size_of_val(words);
+    // With more horizons than bytes it is too short already, and nothing wraps.
+    let count = words.get(2).map_or(0, |h| usize::try_from(*h).unwrap_or(found).min(found));
+    let per_horizon = states.wrapping_add(1);
+    let expected = count.wrapping_mul(per_horizon).wrapping_add(3).wrapping_mul(4);
+    let length = ParseError::SectionLength { kind: ERROR_BOUNDS.0, expected, found };
+    if expected != found {
         return Err(length);
     }
+    let ([coverage, units, _], rest) = words.split_first_chunk().ok_or(length)?;
+    let (horizons, bounds) = rest.split_at_checked(count).ok_or(length)?;
     let bounds = bytemuck::try_cast_slice(bounds).map_err(|_| length)?;
     ErrorBounds::new(states, f32::from_bits(*coverage), *units, horizons, bounds)
         .map_err(ParseError::ErrorBounds)

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::capacity::{
     MAX_BASIS, MAX_BLOCK_FACTORS, MAX_BLOCKS, MAX_FACTORS, MAX_OBSERVABLES, MAX_ORDER, MAX_TERMS,
 };
-use crate::encoding::{ReadError, Reader};
+use crate::encoding::Reader;
 use crate::{Number, Scalar};
 
 /// What an observable reads. The number is the index of the state coordinate or input.
@@ -174,13 +174,10 @@ impl Dictionary {
 
     /// The parts of a dictionary as the metadata hold them, to be [checked](Self::check).
     #[inline(never)]
-    pub(crate) fn read(&mut self, reader: &mut Reader<'_>) -> Result<(), ReadError> {
+    pub(crate) fn read(&mut self, reader: &mut Reader<'_>) {
         reader.list(&mut self.observables, |reader| {
-            let kind = reader.word()?;
-            if kind > 4 {
-                return Err(ReadError::Unsupported);
-            }
-            let (index, lag) = (reader.byte()?, reader.byte()?);
+            let kind = reader.variant(5);
+            let (index, lag) = (reader.byte(), reader.byte());
             let source = match kind {
                 0 => Source::State(index),
                 1 => Source::Sin(index),
@@ -188,20 +185,20 @@ impl Dictionary {
                 3 => Source::Increment(index),
                 _ => Source::Input(index),
             };
-            Ok(Observable { source, lag, centre: reader.number()?, gain: reader.number()? })
-        })?;
+            Observable { source, lag, centre: reader.number(), gain: reader.number() }
+        });
         reader.list(&mut self.factors, |reader| {
-            let observable = reader.byte()?;
-            let basis = match reader.word()? {
+            let observable = reader.byte();
+            let basis = match reader.variant(2) {
                 0 => Basis::Hermite,
-                1 => Basis::Fourier,
-                _ => return Err(ReadError::Unsupported),
+                _ => Basis::Fourier,
             };
-            Ok(Factor { observable, basis, order: reader.byte()? })
-        })?;
+            Factor { observable, basis, order: reader.byte() }
+        });
         reader.list(&mut self.blocks, |reader| {
-            Ok(Block { factors: reader.byte()?, max_degree: reader.byte()? })
-        })
+            let (factors, max_degree) = (reader.byte(), reader.byte());
+            Block { factors, max_degree }
+        });
     }
 
     /// Checks the parts. `E` is the error of whoever asks.
@@ -209,13 +206,15 @@ impl Dictionary {
     pub(crate) fn check<E: From<DictionaryError>>(&mut self) -> Result<(), E> {
         let Self { observables, factors, blocks, .. } = self;
         for (i, o) in observables.iter().enumerate() {
-            let earlier = observables.iter().take(i);
-            if earlier.into_iter().any(|e| (e.source, e.lag) == (o.source, o.lag)) {
+            let earlier = observables.get(..i).unwrap_or(&[]);
+            if earlier.iter().any(|e| (e.source, e.lag) == (o.source, o.lag)) {
                 return Err(DictionaryError::Duplicate { observable: i }.into());
             }
         }
+        // Counts of what is in lists are small: nothing wraps.
         let mut claimed = 0_usize;
-        let mut dense_terms = 0_usize;
+        // All blocks together have less than 2⁶⁴ terms, whatever they are.
+        let mut dense_terms = 0_u64;
         for block in &*blocks {
             let count = usize::from(block.factors);
             if count > MAX_BLOCK_FACTORS {
@@ -226,13 +225,13 @@ impl Dictionary {
                 }
                 .into());
             }
-            let end = claimed.saturating_add(count);
+            let end = claimed.wrapping_add(count);
             let Some(own) = factors.get(claimed..end) else {
                 return Err(DictionaryError::Factors { claimed: end, found: factors.len() }.into());
             };
-            let mut size = 1_usize;
+            let mut size = 1_u64;
             for (i, factor) in own.iter().enumerate() {
-                let bad = DictionaryError::Factor { factor: claimed.saturating_add(i) };
+                let bad = DictionaryError::Factor { factor: claimed.wrapping_add(i) };
                 if factor.order == 0 || factor.order > MAX_ORDER {
                     return Err(DictionaryError::TooLarge {
                         field: "order of a factor",
@@ -245,7 +244,7 @@ impl Dictionary {
                     return Err(bad.into());
                 };
                 if factor.basis == Basis::Fourier {
-                    let cosine = observables.get(usize::from(factor.observable).saturating_add(1));
+                    let cosine = observables.get(usize::from(factor.observable).wrapping_add(1));
                     let pair = match (o.source, cosine) {
                         (Source::Sin(i), Some(c)) => c.source == Source::Cos(i) && c.lag == o.lag,
                         _ => false,
@@ -254,24 +253,26 @@ impl Dictionary {
                         return Err(bad.into());
                     }
                 }
-                if own.iter().take(i).any(|e| overlap(*e, *factor)) {
+                let earlier = own.get(..i).unwrap_or(&[]);
+                if earlier.iter().any(|e| overlap(*e, *factor)) {
                     return Err(bad.into());
                 }
-                size = size.saturating_mul(factor.radix());
+                size = size.wrapping_mul(factor.radix() as u64);
             }
-            dense_terms = dense_terms.saturating_add(size);
+            dense_terms = dense_terms.wrapping_add(size);
             claimed = end;
         }
         if blocks.is_empty() || claimed != factors.len() {
             return Err(DictionaryError::Factors { claimed, found: factors.len() }.into());
         }
         match u16::try_from(dense_terms) {
-            Ok(n) if dense_terms <= MAX_TERMS => {
+            Ok(n) if usize::from(n) <= MAX_TERMS => {
                 self.dense_terms = n;
                 Ok(())
             }
             _ => {
-                let (field, capacity, found) = ("terms", MAX_TERMS, dense_terms);
+                let found = usize::try_from(dense_terms).unwrap_or(usize::MAX);
+                let (field, capacity) = ("terms", MAX_TERMS);
                 Err(DictionaryError::TooLarge { field, capacity, found }.into())
             }
         }
@@ -303,7 +304,7 @@ impl Dictionary {
 
     /// Number of basis functions of all factors, the constant not counted.
     pub fn functions(&self) -> usize {
-        self.factors.iter().fold(0, |sum: usize, f| sum.saturating_add(f.radix()).saturating_sub(1))
+        self.factors.iter().fold(0, |sum: usize, f| sum.wrapping_add(f.radix()).wrapping_sub(1))
     }
 
     /// Which basis function of which factor has an index among the [`functions`](Self::functions)
@@ -520,12 +521,10 @@ fn degree(basis: Basis, digit: usize) -> usize {
     }
 }
 
-/// Whether two factors of one block read the same observable.
+/// Whether two factors of one block, of observables that are there, read the same one.
 fn overlap(a: Factor, b: Factor) -> bool {
-    let reads = |f: Factor, o: u8| {
-        f.observable == o || f.basis == Basis::Fourier && f.observable.checked_add(1) == Some(o)
-    };
-    reads(a, b.observable) || reads(b, a.observable)
+    let last = |f: Factor| f.observable.wrapping_add((f.basis == Basis::Fourier).into());
+    a.observable <= last(b) && b.observable <= last(a)
 }
 
 /// Whether the basis of `candidate` has the function that digit `digit` of `factor` stands for.

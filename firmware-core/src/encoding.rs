@@ -17,99 +17,147 @@ pub(crate) enum ReadError {
     Unsupported,
 }
 
-/// Bytes to be read from the front.
+/// Bytes to be read from the front. Where nothing can be read there is nothing, a zero, say, from there on, and
+/// [`end`](Self::end) says so: no field has to be checked.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Reader<'a> {
     rest: &'a [u8],
+    /// The first thing that was wrong.
+    so_far: Result<(), ReadError>,
 }
 
 impl<'a> Reader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        Self { rest: bytes }
+        Self { rest: bytes, so_far: Ok(()) }
     }
 
-    /// Nothing may be left.
+    /// What was wrong with what has been read.
+    pub(crate) fn so_far(&self) -> Result<(), ReadError> {
+        self.so_far
+    }
+
+    /// The same, and nothing may be left.
     pub(crate) fn end(self) -> Result<(), ReadError> {
+        self.so_far?;
         if self.rest.is_empty() { Ok(()) } else { Err(ReadError::Malformed) }
     }
 
+    /// Nothing can be read any more; what is read instead.
+    #[cold]
+    #[inline(never)]
+    fn fail(&mut self, error: ReadError) -> u8 {
+        self.so_far = self.so_far.and(Err(error));
+        self.rest = &[];
+        0
+    }
+
+    #[inline(never)]
+    pub(crate) fn byte(&mut self) -> u8 {
+        self.next()
+    }
+
     #[inline(always)]
-    pub(crate) fn byte(&mut self) -> Result<u8, ReadError> {
-        let (byte, rest) = self.rest.split_first().ok_or(ReadError::Malformed)?;
+    fn next(&mut self) -> u8 {
+        let Some((byte, rest)) = self.rest.split_first() else {
+            return self.fail(ReadError::Malformed);
+        };
         self.rest = rest;
-        Ok(*byte)
+        *byte
     }
 
     #[inline(always)]
-    pub(crate) fn array<const N: usize>(&mut self) -> Result<[u8; N], ReadError> {
-        let (array, rest) = self.rest.split_first_chunk().ok_or(ReadError::Malformed)?;
+    pub(crate) fn array<const N: usize>(&mut self) -> [u8; N] {
+        let Some((array, rest)) = self.rest.split_first_chunk() else {
+            self.fail(ReadError::Malformed);
+            return [0; N];
+        };
         self.rest = rest;
-        Ok(*array)
+        *array
     }
 
-    #[inline(always)]
-    pub(crate) fn number(&mut self) -> Result<f32, ReadError> {
-        self.array().map(f32::from_le_bytes)
-    }
-
-    #[inline(always)]
-    pub(crate) fn numbers<const N: usize>(&mut self) -> Result<[f32; N], ReadError> {
-        let mut numbers = [0.0; N];
-        for number in &mut numbers {
-            *number = self.number()?;
+    /// As many bytes as there are places.
+    #[inline(never)]
+    pub(crate) fn copy(&mut self, to: &mut [u8]) {
+        match self.rest.split_at_checked(to.len()) {
+            Some((bytes, rest)) => {
+                to.copy_from_slice(bytes);
+                self.rest = rest;
+            }
+            None => _ = self.fail(ReadError::Malformed),
         }
-        Ok(numbers)
+    }
+
+    #[inline(never)]
+    pub(crate) fn number(&mut self) -> f32 {
+        f32::from_le_bytes(self.array())
     }
 
     /// An integer of so many bits.
     #[inline(never)]
-    fn varint(&mut self, bits: u32) -> Result<usize, ReadError> {
-        // A byte, as a rule.
-        if let Some((byte, rest)) = self.rest.split_first()
-            && *byte < 0x80
-        {
-            self.rest = rest;
-            return Ok((*byte).into());
+    fn varint(&mut self, bits: u32) -> usize {
+        match self.next() {
+            byte @ 0x80.. => self.longer(byte, bits),
+            byte => byte.into(),
         }
-        let (mut value, mut shift) = (0_usize, 0_u32);
+    }
+
+    /// One of more than a byte, after the first.
+    #[cold]
+    #[inline(never)]
+    fn longer(&mut self, first: u8, bits: u32) -> usize {
+        let (mut value, mut shift) = (usize::from(first & 0x7F), 7);
         while shift < bits {
-            let byte = self.byte()?;
+            let byte = self.byte();
             let digit = usize::from(byte & 0x7F);
             // The last byte has bits of its own only as far as the integer has.
-            let left = bits.saturating_sub(shift);
+            let left = bits.wrapping_sub(shift);
             if left < 7 && digit.checked_shr(left).unwrap_or(0) != 0 {
-                return Err(ReadError::Malformed);
+                break;
             }
             value |= digit.checked_shl(shift).unwrap_or(0);
             if byte < 0x80 {
-                return Ok(value);
+                return value;
             }
-            shift = shift.saturating_add(7);
+            shift = shift.wrapping_add(7);
         }
-        Err(ReadError::Malformed)
+        self.fail(ReadError::Malformed).into()
     }
 
     #[inline(always)]
-    pub(crate) fn word(&mut self) -> Result<u32, ReadError> {
-        Ok(self.varint(u32::BITS)? as u32)
+    pub(crate) fn word(&mut self) -> u32 {
+        self.varint(u32::BITS) as u32
+    }
+
+    /// One of so many variants.
+    #[inline(never)]
+    pub(crate) fn variant(&mut self, count: u32) -> u32 {
+        let variant = self.word();
+        if variant < count { variant } else { self.fail(ReadError::Unsupported).into() }
     }
 
     #[inline(always)]
-    fn length(&mut self) -> Result<usize, ReadError> {
+    fn length(&mut self) -> usize {
         self.varint(usize::BITS)
     }
 
     /// Bytes behind their length, in place.
-    pub(crate) fn bytes(&mut self) -> Result<&'a [u8], ReadError> {
-        let length = self.length()?;
-        let (bytes, rest) = self.rest.split_at_checked(length).ok_or(ReadError::Malformed)?;
+    pub(crate) fn bytes(&mut self) -> &'a [u8] {
+        let length = self.length();
+        let Some((bytes, rest)) = self.rest.split_at_checked(length) else {
+            self.fail(ReadError::Malformed);
+            return &[];
+        };
         self.rest = rest;
-        Ok(bytes)
+        bytes
     }
 
     /// A text, in place.
-    pub(crate) fn text(&mut self) -> Result<&'a str, ReadError> {
-        core::str::from_utf8(self.bytes()?).map_err(|_| ReadError::Malformed)
+    #[inline(never)]
+    pub(crate) fn text(&mut self) -> &'a str {
+        core::str::from_utf8(self.bytes()).unwrap_or_else(|_| {
+            self.fail(ReadError::Malformed);
+            ""
+        })
     }
 
     /// A list, over the one that is there. No element is empty, so that the bytes bound the work.
@@ -117,26 +165,31 @@ impl<'a> Reader<'a> {
     pub(crate) fn list<T, const N: usize>(
         &mut self,
         to: &mut Vec<T, N>,
-        element: impl Fn(&mut Self) -> Result<T, ReadError>,
-    ) -> Result<(), ReadError> {
+        element: impl Fn(&mut Self) -> T,
+    ) {
         to.clear();
-        for _ in 0..self.length()? {
-            to.push(element(self)?).map_err(|_| ReadError::Unsupported)?;
+        for _ in 0..self.length() {
+            let element = element(self);
+            if self.so_far.is_err() {
+                return;
+            }
+            if to.push(element).is_err() {
+                self.fail(ReadError::Unsupported);
+            }
         }
-        Ok(())
     }
 }
 
 /// Bytes that are written one after the other. What has no room is missing, and [`written`](Self::written)
 /// says so in the end: no field has to be checked.
-pub(crate) struct Writer<const N: usize> {
-    bytes: [u8; N],
+pub(crate) struct Writer<'a> {
+    bytes: &'a mut [u8],
     length: usize,
 }
 
-impl<const N: usize> Writer<N> {
-    pub(crate) fn new() -> Self {
-        Self { bytes: [0; N], length: 0 }
+impl<'a> Writer<'a> {
+    pub(crate) fn new(bytes: &'a mut [u8]) -> Self {
+        Self { bytes, length: 0 }
     }
 
     /// All bytes, unless some had no room.
@@ -144,55 +197,48 @@ impl<const N: usize> Writer<N> {
         self.bytes.get(..self.length)
     }
 
-    /// The whole room; zeros where nothing was written.
-    pub(crate) fn all(&self) -> [u8; N] {
-        self.bytes
-    }
+    // Each gives the writer back: the next one finds it where it is.
 
     #[inline(never)]
-    pub(crate) fn byte(&mut self, byte: u8) {
+    pub(crate) fn byte(&mut self, byte: u8) -> &mut Self {
         if let Some(place) = self.bytes.get_mut(self.length) {
             *place = byte;
         }
-        self.length = self.length.saturating_add(1);
+        self.length = self.length.wrapping_add(1);
+        self
     }
 
     /// Bytes as they are.
     #[inline(never)]
-    pub(crate) fn array(&mut self, bytes: &[u8]) {
-        for byte in bytes {
-            self.byte(*byte);
-        }
+    pub(crate) fn array(&mut self, bytes: &[u8]) -> &mut Self {
+        bytes.iter().fold(self, |to, byte| to.byte(*byte))
     }
 
     /// A varint.
     #[inline(never)]
-    pub(crate) fn word(&mut self, value: u32) {
-        self.long(value.into());
+    pub(crate) fn word(&mut self, value: u32) -> &mut Self {
+        self.long(value.into())
     }
 
     #[inline(never)]
-    pub(crate) fn long(&mut self, value: u64) {
-        let mut rest = value;
+    pub(crate) fn long(&mut self, value: u64) -> &mut Self {
+        let (mut to, mut rest) = (self, value);
         while rest >= 0x80 {
-            self.byte(rest as u8 | 0x80);
+            to = to.byte(rest as u8 | 0x80);
             rest >>= 7;
         }
-        self.byte(rest as u8);
+        to.byte(rest as u8)
     }
 
     /// Bytes, or a text, behind their length.
     #[inline(never)]
-    pub(crate) fn bytes(&mut self, bytes: &[u8]) {
-        self.long(bytes.len() as u64);
-        self.array(bytes);
+    pub(crate) fn bytes(&mut self, bytes: &[u8]) -> &mut Self {
+        self.long(bytes.len() as u64).array(bytes)
     }
 
     #[inline(never)]
-    pub(crate) fn numbers(&mut self, numbers: &[f32]) {
-        self.long(numbers.len() as u64);
-        for number in numbers {
-            self.array(&number.to_le_bytes());
-        }
+    pub(crate) fn numbers(&mut self, numbers: &[f32]) -> &mut Self {
+        let to = self.long(numbers.len() as u64);
+        numbers.iter().fold(to, |to, number| to.array(&number.to_le_bytes()))
     }
 }

@@ -93,7 +93,7 @@ impl<'a> ErrorBounds<'a> {
             let found = bounds.len();
             return Err(ErrorBoundsError::DimensionMismatch { expected, found });
         }
-        if let Some(bound) = bounds.iter().position(|b| !(b.is_finite() && *b >= 0.0)) {
+        if let Some(bound) = bounds.iter().position(|b| !(0.0..=f32::MAX).contains(b)) {
             return Err(ErrorBoundsError::Bound { bound });
         }
         Ok(Self { states, coverage, units, horizons, bounds })

@@ -159,7 +159,7 @@ fn byte(register: usize) -> u8 {
 }
 
 /// Functions of a sparse model whose registers are looked up at once while its program is made.
-const TABLE: usize = 24;
+const TABLE: usize = 32;
 
 impl Program {
     /// Of nothing.
@@ -210,7 +210,7 @@ impl Program {
                 let _ = self.scaled.push([index as u8, *register]);
             }
         }
-        let mut next = usize::from(self.first).saturating_add(self.scaled.len());
+        let mut next = usize::from(self.first).wrapping_add(self.scaled.len());
         let Some(terms) = terms else {
             return if next <= REGISTERS {
                 Ok(())
@@ -229,7 +229,7 @@ impl Program {
             );
             let order = factor.order;
             let _ = self.harmonics.push(Harmonics { sin, cos, order });
-            next = next.saturating_add(usize::from(order).saturating_sub(1).saturating_mul(2));
+            next = next.wrapping_add(usize::from(order).wrapping_sub(1).wrapping_mul(2));
         }
         let first_power = next;
         for factor in factors.iter().filter(|f| f.basis == Basis::Hermite) {
@@ -238,7 +238,7 @@ impl Program {
             for _ in 1..factor.order {
                 let _ = self.products.push([power, v]);
                 power = byte(next);
-                next = next.saturating_add(1);
+                next = next.wrapping_add(1);
             }
         }
         self.powers = self.products.len() as u8;
@@ -246,47 +246,51 @@ impl Program {
         for [parent, _] in terms.entries() {
             let parent = match parent.checked_sub(1) {
                 None => ONE,
-                Some(earlier) => byte(first_term.saturating_add(earlier.into())),
+                Some(earlier) => byte(first_term.wrapping_add(earlier.into())),
             };
             // The register of its function follows.
             let _ = self.products.push([parent, NOWHERE]);
-            next = next.saturating_add(1);
+            next = next.wrapping_add(1);
         }
         if next > REGISTERS {
             let (field, capacity, found) = ("registers", REGISTERS, next);
             return Err(ModelError::Sparse(SparseError::TooLarge { field, capacity, found }).into());
         }
         // Some functions at a time: the registers of all would be half of what loading takes of the stack.
-        for from in (0..dictionary.functions()).step_by(TABLE) {
-            let mut table = [NOWHERE; TABLE];
-            let mut function = 0_usize;
-            let mut put = |register| {
-                let place = function.checked_sub(from).and_then(|place| table.get_mut(place));
-                place.into_iter().for_each(|place| *place = register);
-                function = function.saturating_add(1);
-            };
+        let (mut from, functions) = (0_usize, dictionary.functions());
+        while from < functions {
+            let mut table = [ONE; TABLE];
+            // Where a function belongs: out of bounds where it is not among those of the table.
+            let mut place = 0_usize.wrapping_sub(from);
             let (mut harmonic, mut power) = (first_harmonic, first_power);
             for factor in factors {
-                put(self.observed(layout, factor.observable));
-                let (next, others) = match factor.basis {
-                    Basis::Hermite => (&mut power, 2),
-                    Basis::Fourier => {
-                        put(self.observed(layout, factor.observable.saturating_add(1)));
-                        (&mut harmonic, 3)
-                    }
+                // What is observed, and behind it what is computed.
+                let (next, observed) = match factor.basis {
+                    Basis::Hermite => (&mut power, 1),
+                    Basis::Fourier => (&mut harmonic, 2),
                 };
-                for _ in others..factor.radix() {
-                    put(byte(*next));
-                    *next = next.saturating_add(1);
+                for digit in 1..factor.radix() {
+                    let register = if digit <= observed {
+                        let behind = digit.wrapping_sub(1) as u8;
+                        self.observed(layout, factor.observable.wrapping_add(behind))
+                    } else {
+                        let register = byte(*next);
+                        *next = next.wrapping_add(1);
+                        register
+                    };
+                    if let Some(place) = table.get_mut(place) {
+                        *place = register;
+                    }
+                    place = place.wrapping_add(1);
                 }
             }
-            let terms = self.products.iter_mut().skip(self.powers.into()).zip(terms.entries());
-            for ([_, register], [_, function]) in terms {
-                let place = usize::from(*function).checked_sub(from);
-                if let Some(found) = place.and_then(|place| table.get(place)) {
+            let of_terms = self.products.get_mut(self.powers.into()..).unwrap_or_default();
+            for ([_, register], [_, function]) in of_terms.iter_mut().zip(terms.entries()) {
+                if let Some(found) = table.get(usize::from(*function).wrapping_sub(from)) {
                     *register = *found;
                 }
             }
+            from = from.wrapping_add(TABLE);
         }
         Ok(())
     }

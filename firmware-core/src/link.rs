@@ -33,7 +33,7 @@ use crate::blob::crc32;
 use crate::capacity::MAX_INPUTS;
 use crate::control_loop::telemetry::{Frame, Frames};
 use crate::control_loop::{Command, ControlLoop, Mode};
-use crate::encoding::{ReadError, Reader, Writer};
+use crate::encoding::{Reader, Writer};
 use crate::update::{Answer, Ask, Refused, Request, Say, Updates};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
@@ -112,14 +112,15 @@ impl Message {
 /// [`TooLong`] when `out` has no room for it; [`MAX_FRAME`] bytes always are enough.
 pub fn encode(message: &Message, out: &mut [u8]) -> Result<usize, TooLong> {
     let mut plain = [0; MAX_FRAME];
-    let mut writer = Writer::new();
+    let mut bytes = [0; MAX_FRAME];
+    let mut writer = Writer::new(&mut bytes);
     writer.array(postcard::to_slice(message, &mut plain).map_err(|_| TooLong)?);
     frame(&mut writer, out)
 }
 
 /// The frame of a message: its checksum behind it, the whole stuffed, and the final zero.
 #[inline(never)]
-fn frame(message: &mut Writer<MAX_FRAME>, out: &mut [u8]) -> Result<usize, TooLong> {
+fn frame(message: &mut Writer<'_>, out: &mut [u8]) -> Result<usize, TooLong> {
     let check = crc32(0, message.written().ok_or(TooLong)?);
     message.array(&check.to_le_bytes());
     let stuffed = cobs::try_encode(message.written().ok_or(TooLong)?, out).map_err(|_| TooLong)?;
@@ -195,7 +196,7 @@ impl Receiver {
                 *place = byte;
             }
             // One beyond the end says that the frame was too long.
-            self.length = self.length.saturating_add(1).min(MAX_FRAME.saturating_add(1));
+            self.length = self.length.wrapping_add(1).min(MAX_FRAME.wrapping_add(1));
             return None;
         }
         let length = core::mem::take(&mut self.length);
@@ -244,40 +245,28 @@ enum Incoming<const M: usize> {
 impl<const M: usize> Incoming<M> {
     fn read(body: &[u8], request: &mut Request) -> Self {
         let mut reader = Reader::new(body);
-        if let Ok(read) = Self::known(&mut reader, request)
-            && reader.end().is_ok()
-        {
-            return read;
-        }
-        match unknown(body) {
-            (FRAME | ANSWER, _) => Self::ForHost,
-            (variant, number) => Self::Unknown { variant, number },
-        }
-    }
-
-    /// One that is known, as postcard writes it.
-    fn known(reader: &mut Reader<'_>, request: &mut Request) -> Result<Self, ReadError> {
-        let variant = u8::try_from(reader.word()?).map_err(|_| ReadError::Unsupported)?;
-        Ok(match variant {
-            0 => Self::Command(Command::Start),
-            1 => Self::Command(Command::Stop),
-            2 => Self::Command(Command::Reset),
+        let read = match reader.variant(256) as u8 {
+            0 => Some(Self::Command(Command::Start)),
+            1 => Some(Self::Command(Command::Stop)),
+            2 => Some(Self::Command(Command::Reset)),
             INPUTS => {
                 let mut inputs: Vec<f32, MAX_INPUTS> = Vec::new();
-                reader.list(&mut inputs, Reader::number)?;
-                match inputs.as_slice().try_into() {
-                    Ok(inputs) => Self::Command(Command::Inputs(inputs)),
-                    // Its number of inputs is another.
-                    Err(_) => Self::Unknown { variant: INPUTS, number: 0 },
-                }
+                reader.list(&mut inputs, Reader::number);
+                // Otherwise its number of inputs is another.
+                let inputs = inputs.as_slice().try_into();
+                inputs.ok().map(|inputs| Self::Command(Command::Inputs(inputs)))
             }
             REQUEST => {
-                request.read(reader)?;
-                Self::Request
+                request.read(&mut reader);
+                Some(Self::Request)
             }
-            FRAME | ANSWER => Self::ForHost,
-            _ => return Err(ReadError::Unsupported),
-        })
+            _ => None,
+        };
+        match (read, reader.end(), unknown(body)) {
+            (Some(read), Ok(()), _) => read,
+            (_, _, (FRAME | ANSWER, _)) => Self::ForHost,
+            (_, _, (variant, number)) => Self::Unknown { variant, number },
+        }
     }
 }
 
@@ -394,6 +383,7 @@ impl Port {
         robot.supervisor().is_switched_off() && (self.is_sent() || !is_patient)
     }
 
+    #[inline(never)]
     fn answer(&mut self, answer: Option<Answer>) {
         if let Some(answer) = answer {
             let _ = self.answers.push_back(answer);
@@ -407,15 +397,19 @@ impl Port {
         for _ in 0..2 {
             if self.sent == self.length {
                 let waits = self.answered && frames.ready();
-                let answer = if waits { None } else { self.answers.pop_front() };
+                let answer = self.answers.front().filter(|_| !waits);
                 self.answered = answer.is_some();
-                let mut message = Writer::new();
+                let mut bytes = [0; MAX_FRAME];
+                let mut message = Writer::new(&mut bytes);
+                // They are written where they lie.
                 if let Some(answer) = answer {
                     message.byte(ANSWER);
                     answer.write(&mut message);
-                } else if let Some(frame) = frames.dequeue() {
+                    let _ = self.answers.pop_front();
+                } else if let Some(frame) = frames.peek() {
                     message.byte(FRAME);
                     frame.write(&mut message);
+                    let _ = frames.dequeue();
                 } else {
                     return;
                 }
@@ -726,8 +720,9 @@ mod tests {
         )
     }
 
-    fn written(variant: u8, write: impl FnOnce(&mut Writer<MAX_FRAME>)) -> std::vec::Vec<u8> {
-        let mut writer = Writer::new();
+    fn written(variant: u8, write: impl FnOnce(&mut Writer<'_>)) -> std::vec::Vec<u8> {
+        let mut bytes = [0; MAX_FRAME];
+        let mut writer = Writer::new(&mut bytes);
         writer.byte(variant);
         write(&mut writer);
         writer.written().unwrap().to_vec()

@@ -285,41 +285,39 @@ impl<'a> Structure<'a> {
     #[inline(always)]
     pub(crate) fn read(&mut self, bytes: &'a [u8]) -> Result<(), ReadError> {
         let mut reader = Reader::new(bytes);
-        self.read_spaces(&mut reader)?;
-        self.dictionary.read(&mut reader)?;
-        self.provenance = Provenance { logs: reader.array()?, robot: reader.array()? };
+        self.read_spaces(&mut reader);
+        self.dictionary.read(&mut reader);
+        reader.copy(&mut self.provenance.logs);
+        reader.copy(&mut self.provenance.robot);
         reader.end()
     }
 
     /// What is in front of the dictionary.
     #[inline(never)]
-    fn read_spaces(&mut self, reader: &mut Reader<'a>) -> Result<(), ReadError> {
-        self.robot = reader.text()?;
-        self.sample_time_s = reader.number()?;
+    fn read_spaces(&mut self, reader: &mut Reader<'a>) {
+        self.robot = reader.text();
+        self.sample_time_s = reader.number();
         reader.list(&mut self.states, |reader| {
-            let (name, unit) = (reader.text()?, reader.text()?);
-            let space = match reader.word()? {
+            let (name, unit) = (reader.text(), reader.text());
+            let space = match reader.variant(2) {
                 0 => Space::Line,
-                1 => Space::Circle,
-                _ => return Err(ReadError::Unsupported),
+                _ => Space::Circle,
             };
-            let target = match reader.word()? {
+            let target = match reader.variant(2) {
                 0 => Target::Absolute,
-                1 => Target::Increment,
-                _ => return Err(ReadError::Unsupported),
+                _ => Target::Increment,
             };
-            Ok(State { name, unit, space, target, limit: reader.numbers()? })
-        })?;
+            State { name, unit, space, target, limit: [reader.number(), reader.number()] }
+        });
         reader.list(&mut self.inputs, |reader| {
-            Ok(Input { name: reader.text()?, unit: reader.text()?, range: reader.numbers()? })
-        })?;
-        self.symmetry = match reader.word()? {
+            let (name, unit) = (reader.text(), reader.text());
+            Input { name, unit, range: [reader.number(), reader.number()] }
+        });
+        self.symmetry = match reader.variant(3) {
             0 => Symmetry::None,
-            1 => Symmetry::Translation { coordinates: reader.byte()? },
-            2 => Symmetry::Se2 { x: reader.byte()?, y: reader.byte()?, heading: reader.byte()? },
-            _ => return Err(ReadError::Unsupported),
+            1 => Symmetry::Translation { coordinates: reader.byte() },
+            _ => Symmetry::Se2 { x: reader.byte(), y: reader.byte(), heading: reader.byte() },
         };
-        Ok(())
     }
 
     /// Checks what was read; it is to be [laid out](Self::lay_out) then.
@@ -331,18 +329,19 @@ impl<'a> Structure<'a> {
     where
         E: From<ModelError> + From<DictionaryError>,
     {
-        let mut checked = self.check_spaces();
-        if checked.is_ok() {
-            checked = self.dictionary.check();
-        }
-        if checked.is_ok() {
-            checked = self.check_observables();
-        }
-        checked
+        self.check_spaces::<E>()?;
+        self.check_dictionary::<E>()?;
+        self.check_observables()
+    }
+
+    /// Part of it, as the one before and the one behind it.
+    #[inline(always)]
+    pub(crate) fn check_dictionary<E: From<DictionaryError>>(&mut self) -> Result<(), E> {
+        self.dictionary.check()
     }
 
     /// Where a history keeps what was checked.
-    #[inline(always)]
+    #[inline(never)]
     pub(crate) fn lay_out(&mut self) {
         let observables = self.dictionary.observables();
         let (inputs, symmetry) = (self.inputs.len(), self.symmetry);
@@ -350,11 +349,11 @@ impl<'a> Structure<'a> {
     }
 
     #[inline(never)]
-    fn check_spaces<E: From<ModelError>>(&mut self) -> Result<(), E> {
+    pub(crate) fn check_spaces<E: From<ModelError>>(&mut self) -> Result<(), E> {
         if self.states.is_empty() {
             return Err(ModelError::NoState.into());
         }
-        if !(self.sample_time_s.is_finite() && self.sample_time_s > 0.0) {
+        if !(self.sample_time_s > 0.0 && self.sample_time_s <= f32::MAX) {
             return Err(ModelError::SampleTime.into());
         }
         (self.outputs, self.trigonometric) = (0, 0);
@@ -371,7 +370,7 @@ impl<'a> Structure<'a> {
         }
         for (index, input) in self.inputs.iter().enumerate() {
             let [low, high] = input.range;
-            if !(low < high && low.is_finite() && high.is_finite()) {
+            if !(f32::MIN <= low && low < high && high <= f32::MAX) {
                 return Err(ModelError::Number { field: "range of an input", index }.into());
             }
         }
@@ -383,7 +382,7 @@ impl<'a> Structure<'a> {
     }
 
     #[inline(never)]
-    fn check_observables<E: From<ModelError>>(&mut self) -> Result<(), E> {
+    pub(crate) fn check_observables<E: From<ModelError>>(&mut self) -> Result<(), E> {
         self.lag = 0;
         for (index, o) in self.dictionary.observables().iter().enumerate() {
             let space = |i: u8| self.states.get(usize::from(i)).map(|s| s.space);
@@ -400,7 +399,7 @@ impl<'a> Structure<'a> {
             if !fits || usize::from(o.lag) > MAX_LAG {
                 return Err(ModelError::Observable { observable: index }.into());
             }
-            if !(o.centre.is_finite() && o.gain.is_finite() && o.gain != 0.0) {
+            if !(o.centre.is_finite() && o.gain.abs() > 0.0 && o.gain.abs() <= f32::MAX) {
                 let field = "centre or gain of an observable";
                 return Err(ModelError::Number { field, index }.into());
             }
@@ -703,35 +702,35 @@ impl<'a, S: Scalar> Model<'a, S> {
 
     /// Coefficients and trained ranges of a model with its terms. Error bounds come later.
     #[inline]
-    pub(crate) fn take_numbers(
+    pub(crate) fn take_numbers<E: From<ModelError>>(
         &mut self,
         coefficients: &'a [S],
         ranges: Option<&'a [S]>,
-    ) -> Result<(), ModelError> {
+    ) -> Result<(), E> {
         self.error_bounds = None;
         self.coefficients = coefficients;
         self.ranges = ranges.map(|ranges| ranges.as_chunks().0);
         let structure = &self.structure;
-        let expected = structure.outputs().saturating_mul(self.coefficients_per_output());
+        // Small numbers, all of them: nothing wraps.
+        let expected = structure.outputs().wrapping_mul(self.coefficients_per_output());
         let mismatch =
-            |field, expected, found| Err(ModelError::DimensionMismatch { field, expected, found });
+            |field, expected, found| ModelError::DimensionMismatch { field, expected, found };
         if coefficients.len() != expected {
-            return mismatch("coefficients", expected, coefficients.len());
+            return Err(mismatch("coefficients", expected, coefficients.len()).into());
         }
         if let Some(coefficient) = coefficients.iter().position(|c| !c.is_finite()) {
-            return Err(ModelError::NotFinite { coefficient });
+            return Err(ModelError::NotFinite { coefficient }.into());
         }
         if let Some(ranges) = ranges {
-            let expected = structure.dictionary().observables().len().saturating_mul(2);
+            let expected = structure.dictionary().observables().len().wrapping_mul(2);
             if ranges.len() != expected {
-                return mismatch("ranges", expected, ranges.len());
+                return Err(mismatch("ranges", expected, ranges.len()).into());
             }
             let (pairs, _) = ranges.as_chunks::<2>();
-            if let Some(index) = pairs
-                .iter()
-                .position(|[low, high]| low.partial_cmp(high).is_none_or(Ordering::is_gt))
-            {
-                return Err(ModelError::Number { field: "trained range of an observable", index });
+            // Of what is not a number nothing is true.
+            if let Some(index) = pairs.iter().position(|[low, high]| !matches!(low <= high, true)) {
+                let field = "trained range of an observable";
+                return Err(ModelError::Number { field, index }.into());
             }
         }
         self.known = match (self.program.direct(), self.ranges) {
@@ -748,19 +747,19 @@ impl<'a, S: Scalar> Model<'a, S> {
     /// # Errors
     /// [`ModelError::DimensionMismatch`] if they are for another number of state coordinates.
     pub fn with_error_bounds(mut self, error_bounds: ErrorBounds<'a>) -> Result<Self, ModelError> {
-        self.set_error_bounds(error_bounds)?;
+        self.set_error_bounds::<ModelError>(error_bounds)?;
         Ok(self)
     }
 
     /// The same in place.
-    pub(crate) fn set_error_bounds(
+    pub(crate) fn set_error_bounds<E: From<ModelError>>(
         &mut self,
         error_bounds: ErrorBounds<'a>,
-    ) -> Result<(), ModelError> {
+    ) -> Result<(), E> {
         let (expected, found) = (self.structure.states().len(), error_bounds.states());
         if expected != found {
             let field = "states of the error bounds";
-            return Err(ModelError::DimensionMismatch { field, expected, found });
+            return Err(ModelError::DimensionMismatch { field, expected, found }.into());
         }
         self.error_bounds = Some(error_bounds);
         Ok(())

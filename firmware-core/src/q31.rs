@@ -1003,10 +1003,11 @@ pub fn parse_prefix(slot: &[u8]) -> Result<FixedModel<'_>, LoadError> {
     let sections = Sections::of(blob, &KNOWN)?;
     let missing = ParseError::MissingSection { kind: METADATA.0 };
     // The robot's name is what the metadata begin with.
-    let robot = Reader::new(sections.bytes(METADATA).ok_or(missing)?).text();
-    let robot = robot.map_err(|error| LoadError::Blob(error.into()))?;
+    let mut metadata = Reader::new(sections.bytes(METADATA).ok_or(missing)?);
+    let robot = metadata.text();
+    metadata.so_far().map_err(|error| LoadError::Blob(error.into()))?;
     let model = FixedModel::check(robot, checksum | 1, sections.required(Q31)?)?;
-    let test: &[i32] = sections.required(Q31_SELF_TEST)?;
+    let test: &[i32] = bytemuck::cast_slice(sections.required(Q31_SELF_TEST)?);
     let (given, expected) = test
         .split_at_checked(model.states().wrapping_add(model.inputs()))
         .ok_or(LoadError::Section { field: "self-test" })?;

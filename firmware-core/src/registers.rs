@@ -325,16 +325,20 @@ impl Layout {
     /// FNV-1a of what two layouts that keep the same have in common.
     #[inline(never)]
     fn identify(&mut self, trigonometric: u8) {
-        let Self { first_input, lines, groups, .. } = *self;
-        let bytes = self.heads.iter().flatten().copied().chain([first_input, lines, groups]);
-        let places = self.states.iter().flat_map(|p| [p.x, p.change, p.sin, p.cos]);
-        let kinds = [self.increments.into(), self.pose.is_some().into()];
-        let bytes = bytes.chain(places).chain(kinds);
-        let trigonometric = (0..self.states.len()).map(|i| (trigonometric >> i) & 1);
-        self.id = bytes
-            .chain(trigonometric)
-            .fold(0x811C_9DC5, |id: u32, byte| (id ^ u32::from(byte)).wrapping_mul(0x0100_0193))
-            .max(1);
+        let mut id = 0x811C_9DC5;
+        let mut hash = |bytes: &[u8]| {
+            for byte in bytes {
+                id = (id ^ u32::from(*byte)).wrapping_mul(0x0100_0193);
+            }
+        };
+        hash(self.heads.as_flattened());
+        let kinds = [self.increments.into(), self.pose.is_some().into(), trigonometric];
+        hash(&[self.first_input, self.lines, self.groups]);
+        hash(&kinds);
+        for place in &self.states {
+            hash(&[place.x, place.change, place.sin, place.cos]);
+        }
+        self.id = id.max(1);
     }
 
     /// What becomes of the coordinates.
@@ -377,21 +381,23 @@ impl Layout {
             return next;
         }
         for o in observables {
-            let (i, of): (u8, fn(&mut Place) -> &mut u8) = match o.source {
+            let i = match o.source {
                 Source::Input(_) => {
                     if self.first_input == NOWHERE {
                         self.first_input = take(self.inputs);
                     }
                     continue;
                 }
-                Source::State(i) => (i, |place| &mut place.x),
-                Source::Sin(i) => (i, |place| &mut place.sin),
-                Source::Cos(i) => (i, |place| &mut place.cos),
-                Source::Increment(i) => (i, |place| &mut place.change),
+                Source::State(i) | Source::Sin(i) | Source::Cos(i) | Source::Increment(i) => i,
             };
-            if let Some(place) = self.states.get_mut(usize::from(i)) {
-                *of(place) = take(1);
-            }
+            let Some(place) = self.states.get_mut(usize::from(i)) else { continue };
+            let register = match o.source {
+                Source::Sin(_) => &mut place.sin,
+                Source::Cos(_) => &mut place.cos,
+                Source::Increment(_) => &mut place.change,
+                _ => &mut place.x,
+            };
+            *register = take(1);
         }
         if self.first_input == NOWHERE {
             self.first_input = take(self.inputs);
@@ -412,12 +418,17 @@ impl Layout {
 
     /// The register of a source at its latest sample, and the lag of that sample.
     fn latest(&self, source: Source) -> (u8, u8) {
+        let i = match source {
+            Source::Input(i) => return (self.first_input.saturating_add(i), 0),
+            Source::State(i) | Source::Sin(i) | Source::Cos(i) | Source::Increment(i) => i,
+        };
+        // A checked source is there.
+        let Some(place) = self.states.get(usize::from(i)) else { return (NOWHERE, 0) };
         match source {
-            Source::State(i) => (self.place(i).x, 0),
-            Source::Sin(i) => (self.place(i).sin, 0),
-            Source::Cos(i) => (self.place(i).cos, 0),
-            Source::Increment(i) => (self.place(i).change, 1),
-            Source::Input(i) => (self.first_input.saturating_add(i), 0),
+            Source::Sin(_) => (place.sin, 0),
+            Source::Cos(_) => (place.cos, 0),
+            Source::Increment(_) => (place.change, 1),
+            _ => (place.x, 0),
         }
     }
 
@@ -439,7 +450,7 @@ impl Layout {
                 Some([head, _]) => *head,
                 None => {
                     let own = observables.iter().filter(|other| other.source == o.source);
-                    let oldest = own.map(|o| o.lag).max().unwrap_or(lag);
+                    let oldest = own.fold(lag, |oldest, o| oldest.max(o.lag));
                     let _ = self.heads.push([next, from]);
                     let head = next;
                     next = next.saturating_add(oldest.saturating_sub(lag));
@@ -463,8 +474,7 @@ impl Layout {
                 sum.saturating_add(1).saturating_add(place.kind.absolute_angle().into())
             })
         };
-        let ((sin, _), (cos, _)) =
-            (self.latest(Source::Sin(heading)), self.latest(Source::Cos(heading)));
+        let Place { sin, cos, .. } = *self.states.get(usize::from(heading))?;
         Some(Pose { x, y, ahead: output(x), left: output(y), sin, cos })
     }
 
@@ -472,12 +482,6 @@ impl Layout {
     #[inline]
     pub(crate) fn inputs(&self) -> usize {
         self.inputs.into()
-    }
-
-    /// What becomes of a coordinate that a checked structure has.
-    #[inline]
-    pub(crate) fn place(&self, coordinate: u8) -> Place {
-        self.states.get(usize::from(coordinate)).copied().unwrap_or_default()
     }
 
     /// The registers that a history keeps: those before the inputs and those behind them, each the first

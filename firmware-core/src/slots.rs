@@ -86,7 +86,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::blob::crc32;
-use crate::encoding::{ReadError, Reader, Writer};
+use crate::encoding::{Reader, Writer};
 
 /// First bytes of a slot with a header.
 pub const MAGIC: [u8; 4] = *b"SLOT";
@@ -102,6 +102,8 @@ const HEADER: usize = 64;
 const CELL: usize = 32;
 /// Bytes of a mark's word.
 const WORD: usize = 8;
+/// Four bytes that are erased.
+const BLANK: u32 = u32::MAX;
 /// Header and marks.
 const RECORD: usize = PAYLOAD_OFFSET as usize;
 const ERASED: u8 = 0xFF;
@@ -275,7 +277,7 @@ pub struct Boot<E> {
 }
 
 /// What the host says of a payload before it sends it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Release {
     /// Bytes of the payload.
     pub length: u32,
@@ -297,16 +299,14 @@ impl Release {
 
 impl Release {
     /// As postcard has it.
-    pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self, ReadError> {
-        let (length, sha256) = (reader.word()?, reader.array()?);
-        Ok(Self { length, sha256, sequence: reader.word()?, robot: reader.word()? })
+    pub(crate) fn read(reader: &mut Reader<'_>) -> Self {
+        let (length, mut sha256) = (reader.word(), [0; 32]);
+        reader.copy(&mut sha256);
+        Self { length, sha256, sequence: reader.word(), robot: reader.word() }
     }
 
-    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
-        to.word(self.length);
-        to.array(&self.sha256);
-        to.word(self.sequence);
-        to.word(self.robot);
+    pub(crate) fn write<'w, 'b>(&self, to: &'w mut Writer<'b>) -> &'w mut Writer<'b> {
+        to.word(self.length).array(&self.sha256).word(self.sequence).word(self.robot)
     }
 }
 
@@ -392,75 +392,51 @@ pub enum MarkError<E> {
     Flash(E),
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Header {
-    length: u32,
-    sequence: u32,
+    release: Release,
     generation: u32,
-    robot: u32,
-    sha256: [u8; 32],
 }
+
+/// A header as it lies in the flash; the last word is the CRC-32 of the others.
+type Words = [u32; HEADER / 4];
+
+/// Magic, and version and where the payload begins.
+const BEGINNING: [u32; 2] = [u32::from_le_bytes(MAGIC), VERSION as u32 | (RECORD as u32) << 16];
 
 impl Header {
-    fn release(&self) -> Release {
-        let Self { length, sequence, robot, sha256, .. } = *self;
-        Release { length, sha256, sequence, robot }
+    fn encode(&self) -> Words {
+        let Release { length, sequence, robot, sha256 } = self.release;
+        let ([magic, layout], generation) = (BEGINNING, self.generation);
+        let [a, b, c, d, e, f, g, h]: [u32; 8] = bytemuck::cast(sha256);
+        let mut words =
+            [magic, layout, length, sequence, generation, robot, a, b, c, d, e, f, g, h, 0, 0];
+        let found = check_of(&words);
+        let [.., check] = &mut words;
+        *check = found;
+        words
     }
 
-    fn encode(&self) -> [u8; HEADER] {
-        let mut bytes = [0; HEADER];
-        let mut at = 0_usize;
-        let mut put = |field: &[u8]| {
-            let end = at.saturating_add(field.len());
-            if let Some(place) = bytes.get_mut(at..end) {
-                place.copy_from_slice(field);
-            }
-            at = end;
-        };
-        put(&MAGIC);
-        put(&VERSION.to_le_bytes());
-        put(&(RECORD as u16).to_le_bytes());
-        put(&self.length.to_le_bytes());
-        put(&self.sequence.to_le_bytes());
-        put(&self.generation.to_le_bytes());
-        put(&self.robot.to_le_bytes());
-        put(&self.sha256);
-        put(&[0; 4]);
-        if let Some((body, check)) = bytes.split_last_chunk_mut::<4>() {
-            *check = crc32(0, body).to_le_bytes();
+    /// The header, as far as there is one.
+    fn decode<E>(words: &Words) -> Result<Self, Refusal<E>> {
+        let [magic, layout, length, sequence, generation, robot, sha256 @ .., _, check] = words;
+        if *magic != u32::from_le_bytes(MAGIC) || *check != check_of(words) {
+            return Err(Refusal::Empty);
         }
-        bytes
-    }
-
-    /// The header, `None` where there is none.
-    fn decode(bytes: &[u8]) -> Option<Result<Self, Unreadable>> {
-        let (body, check) = bytes.split_last_chunk::<4>()?;
-        let body = body.strip_prefix(&MAGIC)?;
-        if bytes.len() != HEADER || check_of(bytes) != u32::from_le_bytes(*check) {
-            return None;
+        if [*magic, *layout] != BEGINNING {
+            return Err(Refusal::Layout);
         }
-        let (version, body) = body.split_first_chunk()?;
-        let (payload, mut body) = body.split_first_chunk()?;
-        let mut word = || {
-            let (word, rest) = body.split_first_chunk()?;
-            body = rest;
-            Some(u32::from_le_bytes(*word))
-        };
-        let (length, sequence, generation, robot) = (word()?, word()?, word()?, word()?);
-        let (sha256, _) = body.split_first_chunk()?;
-        let known = u16::from_le_bytes(*version) == VERSION
-            && usize::from(u16::from_le_bytes(*payload)) == RECORD;
-        let header = Self { length, sequence, generation, robot, sha256: *sha256 };
-        Some(if known { Ok(header) } else { Err(Unreadable) })
+        let (length, sequence, robot) = (*length, *sequence, *robot);
+        let sha256 = bytemuck::cast::<[u32; 8], _>(*sha256);
+        let release = Release { length, sha256, sequence, robot };
+        Ok(Self { release, generation: *generation })
     }
 }
 
-/// A header of another version.
-struct Unreadable;
-
-/// CRC-32 of a header's bytes but the last four.
-fn check_of(header: &[u8]) -> u32 {
-    crc32(0, header.split_last_chunk::<4>().map_or(&[], |(body, _)| body))
+/// CRC-32 of a header's words but the last.
+fn check_of(words: &Words) -> u32 {
+    let [body @ .., _] = words;
+    crc32(0, bytemuck::bytes_of(body))
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -474,35 +450,39 @@ enum Mark {
 impl Mark {
     const ALL: [Self; 4] = [Self::Committed, Self::Trial, Self::Confirmed, Self::Rejected];
 
-    fn name(self) -> [u8; 4] {
-        *match self {
+    fn name(self) -> u32 {
+        u32::from_le_bytes(*match self {
             Self::Committed => b"CMIT",
             Self::Trial => b"TRIL",
             Self::Confirmed => b"CNFM",
             Self::Rejected => b"RJCT",
-        }
+        })
     }
 
-    /// Where its cells lie in a slot.
+    /// Where its cells lie in a slot: two for each mark, behind the header.
     fn cells(self) -> [u32; 2] {
-        match self {
-            Self::Committed => [64, 96],
-            Self::Trial => [128, 160],
-            Self::Confirmed => [192, 224],
-            Self::Rejected => [256, 288],
-        }
+        let first = (HEADER as u32).wrapping_add(2 * CELL as u32 * self as u32);
+        [first, first.wrapping_add(CELL as u32)]
     }
 
     /// What a cell holds that is set, in a slot whose header has this CRC.
-    fn cell(self, check: u32) -> [u8; CELL] {
-        let [a, b, c, d] = self.name();
-        let [e, f, g, h] = check.to_le_bytes();
-        let mut cell = [ERASED; CELL];
-        if let Some(word) = cell.first_chunk_mut::<WORD>() {
-            *word = [a, b, c, d, e, f, g, h];
-        }
-        cell
+    fn cell(self, check: u32) -> Cell {
+        [self.name(), check, BLANK, BLANK, BLANK, BLANK, BLANK, BLANK]
     }
+}
+
+/// Bytes of a cell.
+type Cell = [u32; CELL / 4];
+
+/// What a cell reads as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Found {
+    /// Exactly the word.
+    Set,
+    /// All bits are erased.
+    Erased,
+    /// Anything else.
+    Torn,
 }
 
 /// What a mark's two cells read as, together.
@@ -515,13 +495,12 @@ struct Cells {
 }
 
 impl Cells {
-    fn read(mut self, found: &[u8], set: &[u8; CELL]) -> Self {
-        if found == set {
-            self.set = self.set.saturating_add(1);
-        } else if found.iter().all(|byte| *byte == ERASED) {
-            self.erased = self.erased.saturating_add(1);
+    fn count(&mut self, found: Found) {
+        match found {
+            Found::Set => self.set = self.set.wrapping_add(1),
+            Found::Erased => self.erased = self.erased.wrapping_add(1),
+            Found::Torn => {}
         }
-        self
     }
 
     fn is_set(self) -> bool {
@@ -530,15 +509,13 @@ impl Cells {
 }
 
 /// What is written before the payload.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Record {
     header: Header,
     /// CRC-32 of the header.
     check: u32,
-    committed: Cells,
-    trial: Cells,
-    confirmed: Cells,
-    rejected: Cells,
+    /// Those of all marks, in order.
+    marks: [Cells; 4],
 }
 
 /// What a slot is good for.
@@ -556,28 +533,30 @@ enum State {
 impl Record {
     #[inline(never)]
     fn state(&self) -> State {
-        if self.rejected.erased < 2 {
+        let [committed, trial, confirmed, rejected] = &self.marks;
+        if rejected.erased < 2 {
             State::Rejected
-        } else if !self.committed.is_set() {
+        } else if !committed.is_set() {
             State::NotCommitted
-        } else if self.confirmed.is_set() {
+        } else if confirmed.is_set() {
             State::Confirmed
-        } else if self.trial.is_set() || self.trial.erased == 0 {
+        } else if trial.is_set() || trial.erased == 0 {
             State::Rejected
         } else {
             State::Fresh
         }
     }
 
-    /// What orders confirmed slots.
-    fn rank(&self) -> (u32, u32) {
-        (self.header.sequence, self.header.generation)
+    /// What orders confirmed slots; 0 of any other.
+    fn rank(&self) -> u64 {
+        let Header { release, generation } = &self.header;
+        match self.state() {
+            State::Confirmed => {
+                (u64::from(release.sequence) << 32 | u64::from(*generation)).saturating_add(1)
+            }
+            _ => 0,
+        }
     }
-}
-
-/// That of a slot that can be read.
-fn state<E>(record: &Result<Record, E>) -> Option<State> {
-    record.as_ref().ok().map(Record::state)
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -646,69 +625,61 @@ impl<F: NorFlash> Slots<F> {
         let robot = self::robot(robot);
         let (running, trial, update) = (None, false, None);
         let mut slots = Self { flash, geometry, robot, floor: lowest, running, trial, update };
-        let mut records = Side::BOTH.map(|side| (side, slots.settled(side)));
-        for (_, record) in &records {
+        let [mut a, mut b] = [Record::default(); 2];
+        let refused = [slots.settle(Side::A, &mut a), slots.settle(Side::B, &mut b)];
+        for record in [&a, &b] {
+            let Release { robot: of, sequence, .. } = record.header.release;
             // What another robot's firmware left behind says nothing about this one.
-            if let Ok(Record { header, .. }) = record
-                && state(record) == Some(State::Confirmed)
-                && header.robot == robot
-            {
-                slots.floor = slots.floor.max(header.sequence);
+            if record.state() == State::Confirmed && of == robot {
+                slots.floor = slots.floor.max(sequence);
             }
         }
         // Fresh ones before confirmed ones, the newest first.
-        let [a, b] = &records;
-        let key = |record: &Result<Record, _>| {
-            let generation = record.as_ref().map_or(0, |record| record.header.generation);
-            (state(record) == Some(State::Fresh), generation)
-        };
-        if key(&b.1) > key(&a.1) {
-            records.reverse();
+        let key = |record: &Record| (record.state() == State::Fresh, record.header.generation);
+        let mut candidates = [(Side::A, &a), (Side::B, &b)];
+        if key(&b) > key(&a) {
+            candidates.reverse();
         }
 
-        let (running, floor, refused) = (Which::Factory, slots.floor, [None, None]);
+        let (running, floor) = (Which::Factory, slots.floor);
         let mut boot = Boot { running, payload: None, trial, floor, refused };
-        for (side, record) in records {
-            let refusal = match record {
-                Ok(_) if boot.payload.is_some() => continue,
-                Ok(record) => match slots.try_run(side, &record, &mut accept) {
-                    Ok(payload) => {
-                        boot.running = payload.slot;
-                        boot.payload = Some(payload);
-                        boot.trial = slots.trial;
-                        continue;
-                    }
-                    Err(refusal) => refusal,
-                },
-                Err(refusal) => refusal,
+        for (side, record) in candidates {
+            let [of_a, of_b] = &mut boot.refused;
+            let refused = match side {
+                Side::A => of_a,
+                Side::B => of_b,
             };
-            let [a, b] = &mut boot.refused;
-            *match side {
-                Side::A => a,
-                Side::B => b,
-            } = Some(refusal);
+            if boot.payload.is_some() || refused.is_some() {
+                continue;
+            }
+            match slots.try_run(side, record, &mut accept) {
+                Ok(payload) => {
+                    boot.running = payload.slot;
+                    boot.payload = Some(payload);
+                    boot.trial = slots.trial;
+                }
+                Err(refusal) => *refused = Some(refusal),
+            }
         }
         Ok((slots, boot))
     }
 
     /// Reads what is before the payload, and decides for good what a cut may have left undecided.
     #[inline(never)]
-    fn settled(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
-        let record = self.record(side)?;
+    fn settle(&mut self, side: Side, record: &mut Record) -> Option<Refusal<F::Error>> {
+        if let Err(refusal) = self.read(side, record) {
+            return Some(refusal);
+        }
         let state = record.state();
         let is_live = matches!(state, State::Fresh | State::Confirmed);
-        // A failure here leaves what was found, which the next boot finds again.
-        let marks = [
-            (Mark::Committed, record.committed, is_live),
-            (Mark::Confirmed, record.confirmed, state == State::Confirmed),
-            (Mark::Rejected, record.rejected, !is_live),
-        ];
-        for (mark, cells, wanted) in marks {
+        let wanted = [is_live, false, state == State::Confirmed, !is_live];
+        for ((mark, cells), wanted) in Mark::ALL.into_iter().zip(&record.marks).zip(wanted) {
             if wanted && cells.erased > 0 {
+                // A failure here leaves what was found, which the next boot finds again.
                 let _ = self.set(side, mark, record.check);
             }
         }
-        Ok(record)
+        None
     }
 
     /// Checks a slot, marks its trial, and asks the caller.
@@ -719,7 +690,8 @@ impl<F: NorFlash> Slots<F> {
         record: &Record,
         accept: &mut impl FnMut(Payload) -> bool,
     ) -> Result<Payload, Refusal<F::Error>> {
-        let Header { length, sequence, robot, sha256, .. } = record.header;
+        let release = &record.header.release;
+        let Release { sequence, robot, .. } = *release;
         let trial = match record.state() {
             State::NotCommitted => return Err(Refusal::NotCommitted),
             State::Rejected => return Err(Refusal::Rejected),
@@ -732,7 +704,8 @@ impl<F: NorFlash> Slots<F> {
         if sequence < self.floor {
             return Err(Refusal::BelowFloor { floor: self.floor, found: sequence });
         }
-        if self.hash(side, length).map_err(Refusal::Flash)? != sha256 {
+        let payload = self.payload(side, release);
+        if !holds(&mut self.flash, payload.offset, release).map_err(Refusal::Flash)? {
             return Err(Refusal::Payload);
         }
         if trial {
@@ -742,7 +715,6 @@ impl<F: NorFlash> Slots<F> {
                 _ => Refusal::Rejected,
             })?;
         }
-        let payload = self.payload(side, &record.header);
         if !accept(payload) {
             return Err(Refusal::NotAccepted);
         }
@@ -758,13 +730,23 @@ impl<F: NorFlash> Slots<F> {
 
     /// The update that brought what runs; `None` of the factory model.
     pub fn release(&self) -> Option<Release> {
-        self.running.map(|running| running.header.release())
+        self.running.map(|running| running.header.release)
     }
 
     /// The update that is under way.
-    #[inline(never)]
     pub fn update(&self) -> Option<Release> {
-        self.update.as_ref().map(|update| update.header.release())
+        self.update.as_ref().map(|update| update.header.release)
+    }
+
+    /// Whether the update that is under way is one of this release.
+    #[inline(never)]
+    pub(crate) fn is_of(&self, release: &Release) -> bool {
+        self.update.as_ref().is_some_and(|update| update.header.release == *release)
+    }
+
+    /// What headers say of the robot.
+    pub(crate) fn robot(&self) -> u32 {
+        self.robot
     }
 
     /// Whether what runs is still to be [confirmed](Self::confirm).
@@ -791,7 +773,7 @@ impl<F: NorFlash> Slots<F> {
 
     /// Whether the update under way has been [committed](Self::commit).
     pub fn is_committed(&self) -> bool {
-        self.update.is_some_and(|update| update.stage == Stage::Committed)
+        self.update.as_ref().is_some_and(|update| update.stage == Stage::Committed)
     }
 
     /// Gives the flash back.
@@ -803,6 +785,7 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`BeginError`].
+    #[inline(never)]
     pub fn check(&self, release: &Release) -> Result<(), BeginError> {
         let Release { length, sequence, robot, .. } = *release;
         if self.trial {
@@ -827,26 +810,24 @@ impl<F: NorFlash> Slots<F> {
     /// [`BeginError`]; everything is as it was.
     pub fn begin(&mut self, release: &Release) -> Result<(), BeginError> {
         self.check(release)?;
-        let Release { length, sha256, sequence, robot } = *release;
         // That of what runs, even if it cannot be read just now.
-        let mut newest = self.running.map_or(0, |running| running.header.generation);
-        let mut ranks = [None; 2];
-        for (rank, side) in ranks.iter_mut().zip(Side::BOTH) {
+        let mut newest = self.running.as_ref().map_or(0, |running| running.header.generation);
+        let ranks = Side::BOTH.map(|side| {
+            let mut record = Record::default();
             // A slot that cannot be read is empty.
-            let Ok(record) = self.record(side) else { continue };
+            let _ = self.read(side, &mut record);
             newest = newest.max(record.header.generation);
-            *rank = (record.state() == State::Confirmed).then(|| record.rank());
-        }
-        let generation = newest.saturating_add(1);
+            record.rank()
+        });
         let [a, b] = ranks;
-        let side = match self.running {
+        let side = match &self.running {
             Some(running) => running.side.other(),
             None if a <= b => Side::A,
             None => Side::B,
         };
         self.update = Some(Update {
             side,
-            header: Header { length, sequence, generation, robot, sha256 },
+            header: Header { release: *release, generation: newest.saturating_add(1) },
             written: 0,
             tail: [ERASED; CELL],
             // One by one, the header's first: no part of an old payload is gone while its header stands.
@@ -861,16 +842,23 @@ impl<F: NorFlash> Slots<F> {
     /// # Errors
     /// Those of the flash; the update has to begin again.
     pub fn erase(&mut self) -> Result<u32, F::Error> {
-        let Some(Update { side, stage: Stage::Erasing(from), .. }) = self.update else {
+        let Some(Update { side, stage: Stage::Erasing(from), .. }) = &self.update else {
             return Ok(0);
         };
-        let update = self.update.take();
-        let sector = Self::sector();
-        let (to, end) = (from.saturating_add(sector), self.at(side, self.geometry.slot_bytes));
-        self.flash.erase(from, to)?;
-        let stage = if to < end { Stage::Erasing(to) } else { Stage::Writing };
-        self.update = update.map(|update| Update { stage, ..update });
-        Ok(end.saturating_sub(to).div_ceil(sector))
+        let (from, end) = (*from, self.at(*side, self.geometry.slot_bytes));
+        let to = from.wrapping_add(Self::sector());
+        let erased = self.flash.erase(from, to);
+        self.go_on(erased, if to < end { Stage::Erasing(to) } else { Stage::Writing })?;
+        Ok(end.saturating_sub(to).div_ceil(Self::sector()))
+    }
+
+    /// The next stage of the update, or its end if what it takes has failed.
+    fn go_on<T, E>(&mut self, result: Result<T, E>, next: Stage) -> Result<T, E> {
+        match &mut self.update {
+            Some(update) if result.is_ok() => update.stage = next,
+            update => *update = None,
+        }
+        result
     }
 
     /// Sectors of a slot.
@@ -884,52 +872,58 @@ impl<F: NorFlash> Slots<F> {
     /// # Errors
     /// [`WriteError`]; after a failure of the flash the update has to begin again.
     pub fn write(&mut self, offset: u32, part: &[u8]) -> Result<(), WriteError<F::Error>> {
-        let update = self.update.filter(|update| update.stage == Stage::Writing);
-        let mut update = update.ok_or(WriteError::NotWriting)?;
+        let update = self.update.as_ref().filter(|update| update.stage == Stage::Writing);
+        let update = update.ok_or(WriteError::NotWriting)?;
         if offset != update.written {
             return Err(WriteError::OutOfOrder { expected: update.written, found: offset });
         }
-        let room = update.header.length.saturating_sub(update.written);
-        let too_long = WriteError::TooLong { room, found: part.len() };
-        let length = u32::try_from(part.len()).map_err(|_| too_long)?;
-        if length > room {
-            return Err(WriteError::TooLong { room, found: part.len() });
+        let room = update.header.release.length.saturating_sub(update.written);
+        if u32::try_from(part.len()).is_ok_and(|length| length <= room) {
+            let appended = self.append(part);
+            return self.go_on(appended, Stage::Writing).map_err(WriteError::Flash);
         }
+        Err(WriteError::TooLong { room, found: part.len() })
+    }
 
+    /// Writes a part that has room as far as it fills write units.
+    fn append(&mut self, part: &[u8]) -> Result<(), F::Error> {
         let unit = F::WRITE_SIZE;
-        let waiting = unaligned(update.written, unit);
-        let mut at = self.at(update.side, PAYLOAD_OFFSET).saturating_add(update.written);
-        at = at.saturating_sub(u32::try_from(waiting).unwrap_or(0));
-        // What is only in memory: nothing is lost if the flash fails, because the update is, then.
-        self.update = None;
+        let mut at = self.waiting_at();
+        let Some(Update { written, tail, .. }) = &mut self.update else { return Ok(()) };
+        let waiting = unaligned(*written, unit);
+        *written = written.wrapping_add(part.len() as u32);
         let mut rest = part;
         if waiting > 0 {
-            let (head, more) = rest.split_at(unit.saturating_sub(waiting).min(rest.len()));
-            let filled = waiting.saturating_add(head.len());
-            if let Some(place) = update.tail.get_mut(waiting..filled) {
+            let (head, more) = rest.split_at(unit.wrapping_sub(waiting).min(rest.len()));
+            let filled = waiting.wrapping_add(head.len());
+            if let Some(place) = tail.get_mut(waiting..filled) {
                 place.copy_from_slice(head);
             }
+            if filled < unit {
+                return Ok(());
+            }
             rest = more;
-            if filled == unit {
-                let tail = update.tail.get(..unit).unwrap_or(&[]);
-                self.flash.write(at, tail).map_err(WriteError::Flash)?;
-                at = at.saturating_add(u32::try_from(unit).unwrap_or(0));
-                update.tail = [ERASED; CELL];
-            }
+            self.flash.write(at, tail.get(..unit).unwrap_or(&[]))?;
+            at = at.wrapping_add(unit as u32);
+            *tail = [ERASED; CELL];
         }
-        if !rest.is_empty() {
-            let left = rest.len().checked_rem(unit).unwrap_or(0);
-            let (whole, left) = rest.split_at(rest.len().saturating_sub(left));
-            if !whole.is_empty() {
-                self.flash.write(at, whole).map_err(WriteError::Flash)?;
-            }
-            if let Some(place) = update.tail.get_mut(..left.len()) {
-                place.copy_from_slice(left);
-            }
+        let left = rest.len().checked_rem(unit).unwrap_or(0);
+        let (whole, left) = rest.split_at(rest.len().saturating_sub(left));
+        if !whole.is_empty() {
+            self.flash.write(at, whole)?;
         }
-        update.written = update.written.saturating_add(length);
-        self.update = Some(update);
+        if let Some(place) = tail.get_mut(..left.len()) {
+            place.copy_from_slice(left);
+        }
         Ok(())
+    }
+
+    /// Where in the flash that belongs of the update what does not fill a write unit yet.
+    fn waiting_at(&self) -> u32 {
+        self.update.as_ref().map_or(0, |update| {
+            let waiting = unaligned(update.written, F::WRITE_SIZE) as u32;
+            self.at(update.side, PAYLOAD_OFFSET).wrapping_add(update.written).wrapping_sub(waiting)
+        })
     }
 
     /// Reads the whole payload back and compares its hash with the release.
@@ -937,31 +931,33 @@ impl<F: NorFlash> Slots<F> {
     /// # Errors
     /// [`VerifyError`]; unless parts are missing the update has to begin again.
     pub fn verify(&mut self) -> Result<Payload, VerifyError<F::Error>> {
-        let mut update = self.update.ok_or(VerifyError::NotWriting)?;
-        let Update { side, written, header, .. } = update;
-        let payload = self.payload(side, &header);
+        let update = self.update.as_ref().ok_or(VerifyError::NotWriting)?;
+        let (written, length) = (update.written, update.header.release.length);
+        let payload = self.payload(update.side, &update.header.release);
         match update.stage {
             Stage::Writing => {}
             Stage::Verified => return Ok(payload),
             Stage::Erasing(_) | Stage::Committed => return Err(VerifyError::NotWriting),
         }
-        if written != header.length {
-            return Err(VerifyError::Incomplete { written, length: header.length });
+        if written != length {
+            return Err(VerifyError::Incomplete { written, length });
         }
-        self.update = None;
-        let waiting = unaligned(written, F::WRITE_SIZE);
-        if waiting > 0 {
-            let at = self.at(side, PAYLOAD_OFFSET).saturating_add(written);
-            let at = at.saturating_sub(u32::try_from(waiting).unwrap_or(0));
-            let tail = update.tail.get(..F::WRITE_SIZE).unwrap_or(&[]);
-            self.flash.write(at, tail).map_err(VerifyError::Flash)?;
+        let right = match self.read_back(payload) {
+            Ok(true) => Ok(payload),
+            Ok(false) => Err(VerifyError::Hash),
+            Err(error) => Err(VerifyError::Flash(error)),
+        };
+        self.go_on(right, Stage::Verified)
+    }
+
+    /// Writes what is left of the payload: whether it is what it was to be.
+    fn read_back(&mut self, payload: Payload) -> Result<bool, F::Error> {
+        let at = self.waiting_at();
+        let Some(Update { written, tail, header, .. }) = &self.update else { return Ok(false) };
+        if unaligned(*written, F::WRITE_SIZE) > 0 {
+            self.flash.write(at, tail.get(..F::WRITE_SIZE).unwrap_or(&[]))?;
         }
-        if self.hash(side, header.length).map_err(VerifyError::Flash)? != header.sha256 {
-            return Err(VerifyError::Hash);
-        }
-        update.stage = Stage::Verified;
-        self.update = Some(update);
-        Ok(payload)
+        holds(&mut self.flash, payload.offset, &header.release)
     }
 
     /// Writes header and commit mark: the next boot tries the model.
@@ -969,21 +965,23 @@ impl<F: NorFlash> Slots<F> {
     /// # Errors
     /// [`MarkError`]; the update has to begin again, unless it was [not ready](MarkError::NotReady).
     pub fn commit(&mut self) -> Result<(), MarkError<F::Error>> {
-        let update = self.update.filter(|update| update.stage == Stage::Verified);
-        let mut update = update.ok_or(MarkError::NotReady)?;
-        let bytes = update.header.encode();
-        let at = self.at(update.side, 0);
-        self.update = None;
-        self.flash.write(at, &bytes).map_err(MarkError::Flash)?;
-        let mut found = [0; HEADER];
-        self.flash.read(at, &mut found).map_err(MarkError::Flash)?;
-        if found != bytes {
+        let update = self.update.as_ref().filter(|update| update.stage == Stage::Verified);
+        let Update { side, header, .. } = update.ok_or(MarkError::NotReady)?;
+        let (side, words) = (*side, header.encode());
+        let committed = self.write_header(side, &words);
+        self.go_on(committed, Stage::Committed)
+    }
+
+    fn write_header(&mut self, side: Side, words: &Words) -> Result<(), MarkError<F::Error>> {
+        let at = self.at(side, 0);
+        self.flash.write(at, bytemuck::bytes_of(words)).map_err(MarkError::Flash)?;
+        let mut found = [0; HEADER / 4];
+        self.flash.read(at, bytemuck::bytes_of_mut(&mut found)).map_err(MarkError::Flash)?;
+        if found != *words {
             return Err(MarkError::ReadBack);
         }
-        self.set(update.side, Mark::Committed, check_of(&bytes))?;
-        update.stage = Stage::Committed;
-        self.update = Some(update);
-        Ok(())
+        let [.., check] = *words;
+        self.set(side, Mark::Committed, check)
     }
 
     /// Drops the update that is under way, or that is committed since power-on: the next boot does not
@@ -992,11 +990,12 @@ impl<F: NorFlash> Slots<F> {
     /// # Errors
     /// [`MarkError`]: a committed update could not be marked as rejected; `begin` another one over it.
     pub fn abort(&mut self) -> Result<(), MarkError<F::Error>> {
-        match self.update.take() {
-            Some(Update { side, header, stage: Stage::Committed, .. }) => {
-                self.set(side, Mark::Rejected, check_of(&header.encode()))
-            }
-            _ => Ok(()),
+        let update = self.update.as_ref().filter(|update| update.stage == Stage::Committed);
+        let committed = update.map(|update| (update.side, update.header.encode()));
+        self.update = None;
+        match committed {
+            Some((side, [.., check])) => self.set(side, Mark::Rejected, check),
+            None => Ok(()),
         }
     }
 
@@ -1005,16 +1004,17 @@ impl<F: NorFlash> Slots<F> {
     /// # Errors
     /// [`MarkError::NotReady`] if nothing is on trial; otherwise the model stays on trial.
     pub fn confirm(&mut self) -> Result<(), MarkError<F::Error>> {
-        let running = self.running.filter(|_| self.trial).ok_or(MarkError::NotReady)?;
+        let running = self.running.as_ref().filter(|_| self.trial).ok_or(MarkError::NotReady)?;
+        let sequence = running.header.release.sequence;
         self.set(running.side, Mark::Confirmed, running.check)?;
         self.trial = false;
-        self.floor = self.floor.max(running.header.sequence);
+        self.floor = self.floor.max(sequence);
         Ok(())
     }
 
-    /// Where the payload of a slot with this header lies.
-    fn payload(&self, side: Side, header: &Header) -> Payload {
-        let Header { length, sequence, .. } = *header;
+    /// Where the payload of a release lies in a slot.
+    fn payload(&self, side: Side, release: &Release) -> Payload {
+        let Release { length, sequence, .. } = *release;
         Payload { slot: side.into(), offset: self.at(side, PAYLOAD_OFFSET), length, sequence }
     }
 
@@ -1023,89 +1023,95 @@ impl<F: NorFlash> Slots<F> {
         u32::try_from(F::ERASE_SIZE).unwrap_or(u32::MAX)
     }
 
-    /// Where a byte of a slot lies in the flash.
+    /// Where a byte of a slot lies in the flash. Its address has been checked, so that nothing wraps.
     fn at(&self, side: Side, offset: u32) -> u32 {
         let Geometry { offset: first, slot_bytes } = self.geometry;
-        let slot = match side {
-            Side::A => first,
-            Side::B => first.saturating_add(slot_bytes),
-        };
-        slot.saturating_add(offset)
+        first.wrapping_add(slot_bytes.wrapping_mul(side as u32)).wrapping_add(offset)
     }
 
+    /// Reads what is before the payload; a record whose header cannot be read stays that of nothing.
     #[inline(never)]
-    fn record(&mut self, side: Side) -> Result<Record, Refusal<F::Error>> {
-        let mut bytes = [0; HEADER];
-        self.flash.read(self.at(side, 0), &mut bytes).map_err(Refusal::Flash)?;
-        let check = check_of(&bytes);
-        let header = Header::decode(&bytes).ok_or(Refusal::Empty)?;
-        let header = header.map_err(|Unreadable| Refusal::Layout)?;
-        if header.length == 0 || header.length > self.room() {
+    fn read(&mut self, side: Side, record: &mut Record) -> Result<(), Refusal<F::Error>> {
+        let mut words = [0; HEADER / 4];
+        let at = self.at(side, 0);
+        self.flash.read(at, bytemuck::bytes_of_mut(&mut words)).map_err(Refusal::Flash)?;
+        let header = Header::decode(&words)?;
+        if header.release.length == 0 || header.release.length > self.room() {
             return Err(Refusal::Layout);
         }
+        let [.., check] = words;
         // One by one: with error correction a torn cell may be an error, and the others say enough.
-        let mut marks = Mark::ALL.map(|mark| (mark, Cells::default()));
-        for (mark, read) in &mut marks {
-            let set = mark.cell(check);
+        for (mark, cells) in Mark::ALL.into_iter().zip(&mut record.marks) {
             for cell in mark.cells() {
-                let mut found = [0; CELL];
-                match self.flash.read(self.at(side, cell), &mut found) {
+                match self.look(self.at(side, cell), mark, check) {
                     // A slot that may have been rejected does not run.
-                    Err(error) if *mark == Mark::Rejected => return Err(Refusal::Flash(error)),
+                    Err(error) if mark == Mark::Rejected => return Err(Refusal::Flash(error)),
                     Err(_) => {}
-                    Ok(()) => *read = read.read(&found, &set),
+                    Ok(found) => cells.count(found),
                 }
             }
         }
-        let [(_, committed), (_, trial), (_, confirmed), (_, rejected)] = marks;
-        Ok(Record { header, check, committed, trial, confirmed, rejected })
+        (record.header, record.check) = (header, check);
+        Ok(())
+    }
+
+    /// What a cell of a mark reads as.
+    #[inline(never)]
+    fn look(&mut self, at: u32, mark: Mark, check: u32) -> Result<Found, F::Error> {
+        let mut cell = [0; CELL / 4];
+        self.flash.read(at, bytemuck::bytes_of_mut(&mut cell))?;
+        let [name, of, rest @ ..] = cell;
+        Ok(match rest.iter().all(|word| *word == BLANK) {
+            true if [name, of] == [mark.name(), check] => Found::Set,
+            true if [name, of] == [BLANK; 2] => Found::Erased,
+            _ => Found::Torn,
+        })
     }
 
     /// Programs the cells of a mark that are still erased.
+    #[inline(never)]
     fn set(&mut self, side: Side, mark: Mark, check: u32) -> Result<(), MarkError<F::Error>> {
-        let set = mark.cell(check);
-        let word = set.get(..WORD.max(F::WRITE_SIZE)).unwrap_or(&set);
         let mut result = Err(MarkError::ReadBack);
         for cell in mark.cells() {
-            let at = self.at(side, cell);
-            match self.set_cell(at, word, &set) {
-                Ok(true) => result = Ok(()),
-                Ok(false) => {}
+            match self.set_cell(self.at(side, cell), mark, check) {
+                Ok(Found::Set) => result = Ok(()),
+                Ok(_) => {}
                 Err(error) => result = result.or(Err(MarkError::Flash(error))),
             }
         }
         result
     }
 
-    /// Whether the cell holds the word in the end.
-    fn set_cell(&mut self, at: u32, word: &[u8], set: &[u8; CELL]) -> Result<bool, F::Error> {
-        let mut found = [0; CELL];
-        self.flash.read(at, &mut found)?;
-        if found.iter().all(|byte| *byte == ERASED) {
-            self.flash.write(at, word)?;
-            self.flash.read(at, &mut found)?;
+    /// What the cell reads as in the end.
+    fn set_cell(&mut self, at: u32, mark: Mark, check: u32) -> Result<Found, F::Error> {
+        let found = self.look(at, mark, check)?;
+        if found != Found::Erased {
+            return Ok(found);
         }
-        Ok(found == *set)
+        let cell = mark.cell(check);
+        let bytes = bytemuck::bytes_of(&cell);
+        self.flash.write(at, bytes.get(..WORD.max(F::WRITE_SIZE)).unwrap_or(bytes))?;
+        self.look(at, mark, check)
     }
+}
 
-    /// SHA-256 of a payload.
-    fn hash(&mut self, side: Side, length: u32) -> Result<[u8; 32], F::Error> {
-        let mut digest = Sha256::new();
-        let mut at = self.at(side, PAYLOAD_OFFSET);
-        let mut left = usize::try_from(length).unwrap_or(usize::MAX);
-        let mut buffer = [0; BUFFER];
-        while left > 0 {
-            let length = left.min(BUFFER);
-            // In whole read units; they end within the slot, which ends with a sector.
-            let whole = length.checked_next_multiple_of(CELL).unwrap_or(BUFFER).min(BUFFER);
-            let part = buffer.get_mut(..whole).unwrap_or(&mut []);
-            self.flash.read(at, part)?;
-            feed(&mut digest, part.get(..length).unwrap_or(&[]));
-            left = left.saturating_sub(length);
-            at = at.saturating_add(u32::try_from(whole).unwrap_or(u32::MAX));
-        }
-        Ok(finish(digest))
+/// Whether what lies in the flash has the hash of a release.
+#[inline(never)]
+fn holds<F: NorFlash>(flash: &mut F, at: u32, release: &Release) -> Result<bool, F::Error> {
+    let mut digest = Sha256::new();
+    let (mut at, mut left) = (at, release.length as usize);
+    let mut buffer = [0; BUFFER];
+    while left > 0 {
+        let length = left.min(BUFFER);
+        // In whole read units; they end within the slot, which ends with a sector.
+        let whole = length.next_multiple_of(CELL).min(BUFFER);
+        let part = buffer.get_mut(..whole).unwrap_or(&mut []);
+        flash.read(at, part)?;
+        feed(&mut digest, part.get(..length).unwrap_or(&[]));
+        left = left.wrapping_sub(length);
+        at = at.wrapping_add(whole as u32);
     }
+    Ok(finish(digest) == release.sha256)
 }
 
 /// Bytes beyond the last whole unit.

@@ -101,16 +101,16 @@ impl<'a> SparseTerms<'a> {
             return Err(SparseError::Block { block });
         }
         let functions = dictionary.functions();
-        for (field, capacity, found) in [
-            ("functions", MAX_FUNCTIONS, functions),
-            ("sparse terms", MAX_SPARSE_TERMS, entries.len()),
-        ] {
-            if found > capacity {
-                return Err(SparseError::TooLarge { field, capacity, found });
-            }
+        if functions > MAX_FUNCTIONS {
+            let (field, capacity, found) = ("functions", MAX_FUNCTIONS, functions);
+            return Err(SparseError::TooLarge { field, capacity, found });
+        }
+        if entries.len() > MAX_SPARSE_TERMS {
+            let (field, capacity, found) = ("sparse terms", MAX_SPARSE_TERMS, entries.len());
+            return Err(SparseError::TooLarge { field, capacity, found });
         }
         for (earlier, [parent, function]) in entries.iter().enumerate() {
-            let term = earlier.saturating_add(1);
+            let term = earlier.wrapping_add(1);
             if usize::from(*parent) > earlier {
                 return Err(SparseError::Parent { term });
             }
@@ -130,7 +130,7 @@ impl<'a> SparseTerms<'a> {
     /// Number of terms, the constant included: the number of coefficients per output.
     #[inline]
     pub fn count(&self) -> usize {
-        self.entries.len().saturating_add(1)
+        self.entries.len().wrapping_add(1)
     }
 
     /// Indices of the functions whose product a term is, from the last one multiplied to the first;

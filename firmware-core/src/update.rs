@@ -159,11 +159,11 @@ use crate::capacity::{
 };
 use crate::control_loop::{Alarms, Mode};
 use crate::cost;
-use crate::encoding::{ReadError, Reader, Writer};
+use crate::encoding::{Reader, Writer};
 use crate::model::Model;
 use crate::slots::{
     BeginError, Boot, Geometry, GeometryError, MarkError, Payload, Release, Slots, VerifyError,
-    Which, WriteError, robot, sha256,
+    Which, WriteError, sha256,
 };
 
 /// The version of the protocol.
@@ -246,28 +246,25 @@ pub enum Ask {
 impl Request {
     /// As postcard has it, over the one that is there.
     #[inline(never)]
-    pub(crate) fn read(&mut self, reader: &mut Reader<'_>) -> Result<(), ReadError> {
-        self.number = reader.byte()?;
-        let kind = reader.word()?;
-        if kind > 6 {
-            return Err(ReadError::Unsupported);
-        }
+    pub(crate) fn read(&mut self, reader: &mut Reader<'_>) {
+        self.number = reader.byte();
+        let kind = reader.variant(7);
         // All but Hello and Confirm are of a session.
-        let session = if kind == 0 || kind == 5 { 0 } else { reader.word()? };
+        let session = if kind == 0 || kind == 5 { 0 } else { reader.word() };
         self.ask = match kind {
             0 => Ask::Hello,
             1 => {
-                let release = Release::read(reader)?;
+                let release = Release::read(reader);
                 Ask::Begin { session, release, signature: Signature::new() }
             }
-            2 => Ask::Chunk { session, offset: reader.word()?, bytes: Vec::new() },
+            2 => Ask::Chunk { session, offset: reader.word(), bytes: Vec::new() },
             3 => Ask::Verify { session },
             4 => Ask::Activate { session, signature: Signature::new() },
             5 => Ask::Confirm { signature: Signature::new() },
             _ => Ask::Abort { session, signature: Signature::new() },
         };
         match &mut self.ask {
-            Ask::Hello | Ask::Verify { .. } => Ok(()),
+            Ask::Hello | Ask::Verify { .. } => {}
             Ask::Chunk { bytes, .. } => reader.list(bytes, Reader::byte),
             Ask::Begin { signature, .. }
             | Ask::Activate { signature, .. }
@@ -289,13 +286,10 @@ pub struct Answer {
 impl Answer {
     /// As postcard writes it.
     #[inline(never)]
-    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
-        to.byte(self.number);
+    pub(crate) fn write(&self, to: &mut Writer<'_>) {
+        let to = to.byte(self.number);
         let (kind, number) = match &self.say {
-            Say::Hello(hello) => {
-                to.byte(0);
-                return hello.write(to);
-            }
+            Say::Hello(hello) => return hello.write(to.byte(0)),
             Say::Working { most_ms } => (1, Some(*most_ms)),
             Say::Begun { written } => (2, Some(*written)),
             Say::Written { written } => (3, Some(*written)),
@@ -303,13 +297,10 @@ impl Answer {
             Say::Activated => (5, None),
             Say::Confirmed => (6, None),
             Say::Aborted => (7, None),
-            Say::Refused(refused) => {
-                to.byte(8);
-                return refused.write(to);
-            }
+            Say::Refused(refused) => return refused.write(to.byte(8)),
         };
-        to.byte(kind);
-        number.into_iter().for_each(|number| to.word(number));
+        let to = to.byte(kind);
+        number.into_iter().for_each(|number| _ = to.word(number));
     }
 }
 
@@ -374,7 +365,7 @@ pub enum Refused {
     },
     /// The model is one of another robot.
     AnotherRobot {
-        /// [`robot`] of the name of this one.
+        /// [`robot`](crate::slots::robot) of the name of this one.
         robot: u32,
     },
     /// The release is older than what has been confirmed.
@@ -425,11 +416,11 @@ pub enum Refused {
 
 impl Refused {
     #[inline(never)]
-    fn write<const C: usize>(self, to: &mut Writer<C>) {
+    fn write(self, to: &mut Writer<'_>) {
         let (kind, number) = match self {
             Self::Unknown { variant } => {
-                to.byte(0);
-                return to.byte(variant);
+                to.byte(0).byte(variant);
+                return;
             }
             Self::TooLong { most } => (1, Some(most)),
             Self::Busy => (2, None),
@@ -449,14 +440,13 @@ impl Refused {
             Self::NotVerified => (16, None),
             Self::NotOnTrial => (17, None),
             Self::TooEarly { good, needed } => {
-                to.byte(18);
-                to.word(good);
-                return to.word(needed);
+                to.byte(18).word(good).word(needed);
+                return;
             }
             Self::Flash => (19, None),
         };
-        to.byte(kind);
-        number.into_iter().for_each(|number| to.word(number));
+        let to = to.byte(kind);
+        number.into_iter().for_each(|number| _ = to.word(number));
     }
 }
 
@@ -469,7 +459,7 @@ pub struct Hello {
     pub firmware: String<NAME>,
     /// Beginning of the robot's name, as far as there is room.
     pub name: String<NAME>,
-    /// [`robot`] of the whole name.
+    /// [`robot`](crate::slots::robot) of the whole name.
     pub robot: u32,
     /// What the loop is doing.
     pub mode: Mode,
@@ -488,33 +478,21 @@ pub struct Hello {
 }
 
 impl Hello {
-    fn write<const C: usize>(&self, to: &mut Writer<C>) {
-        to.byte(self.protocol);
-        to.bytes(self.firmware.as_bytes());
-        to.bytes(self.name.as_bytes());
-        to.word(self.robot);
-        to.byte(self.mode as u8);
-        let Capacities { sample_us, states, inputs, room, instructions, lag, .. } = self.capacities;
-        let Capacities { observables, blocks, factors, terms, sparse_terms, .. } = self.capacities;
-        to.word(sample_us);
-        to.byte(states);
-        to.byte(inputs);
-        to.word(room);
-        to.word(instructions);
-        to.byte(lag);
-        for capacity in [observables, blocks, factors, terms, sparse_terms] {
-            to.word(capacity.into());
-        }
-        to.byte(self.which as u8);
-        self.release.write(to);
-        to.byte(self.trial.is_some().into());
+    fn write(&self, to: &mut Writer<'_>) {
+        let Capacities { sample_us, states, inputs, room, instructions, lag, .. } =
+            &self.capacities;
+        let Capacities { observables, blocks, factors, terms, sparse_terms, .. } = &self.capacities;
+        let to = to.byte(self.protocol).bytes(self.firmware.as_bytes());
+        let to = to.bytes(self.name.as_bytes()).word(self.robot).byte(self.mode as u8);
+        let to = to.word(*sample_us).byte(*states).byte(*inputs).word(*room).word(*instructions);
+        let to = to.byte(*lag).word((*observables).into()).word((*blocks).into());
+        let to = to.word((*factors).into()).word((*terms).into()).word((*sparse_terms).into());
+        let to = self.release.write(to.byte(self.which as u8)).byte(self.trial.is_some().into());
         if let Some(Trial { good, needed }) = self.trial {
-            to.word(good);
-            to.word(needed);
+            to.word(good).word(needed);
         }
-        to.word(self.floor);
-        to.byte(self.key.is_some().into());
-        self.key.iter().for_each(|key| to.array(key));
+        to.word(self.floor).byte(self.key.is_some().into());
+        self.key.iter().for_each(|key| _ = to.array(key));
     }
 }
 
@@ -674,14 +652,15 @@ impl Purpose {
 /// ```
 pub fn statement(purpose: Purpose, release: &Release) -> [u8; 64] {
     let Release { length, sha256, sequence, robot } = release;
-    let mut statement = Writer::<64>::new();
+    let mut bytes = [0; 64];
+    let mut statement = Writer::new(&mut bytes);
     statement.array(b"koopman-release\0");
     statement.array(&[purpose as u8, 0, 0, 0]);
     for number in [robot, sequence, length] {
         statement.array(&number.to_le_bytes());
     }
     statement.array(sha256);
-    statement.all()
+    bytes
 }
 
 /// Whose releases are installed.
@@ -874,9 +853,8 @@ where
     ) -> Result<(Self, Boot<F::Error>), GeometryError> {
         let (slots, boot) = Slots::boot(flash, geometry, identity.robot, lowest, &mut accept)?;
         let release = slots.release().unwrap_or_else(|| {
-            let Identity { robot: name, factory, .. } = identity;
-            let (length, sha256) = (count(factory.len()), sha256(factory));
-            Release { length, sha256, sequence: 0, robot: robot(name) }
+            let (length, sha256) = (count(identity.factory.len()), sha256(identity.factory));
+            Release { length, sha256, sequence: 0, robot: slots.robot() }
         });
         let (session, job, pause_until_us) = (None, None, 0);
         let (wrong_signature, worked, good, resets) = (false, false, 0, false);
@@ -921,14 +899,14 @@ where
     }
 
     fn hello(&self, mode: Mode) -> Hello {
-        let Identity { firmware, robot: name, capacities, .. } = self.identity;
+        let Identity { firmware, robot: name, capacities, .. } = &self.identity;
         Hello {
             protocol: PROTOCOL,
             firmware: beginning(firmware),
             name: beginning(name),
-            robot: robot(name),
+            robot: self.slots.robot(),
             mode,
-            capacities: Capacities { room: self.slots.room(), ..capacities },
+            capacities: Capacities { room: self.slots.room(), ..*capacities },
             which: self.slots.running(),
             release: self.release,
             trial: self.trial(),
@@ -987,11 +965,18 @@ where
         if self.resets && !matches!(ask, Ask::Activate { .. }) {
             return Err(Refused::Working);
         }
+        if let Ask::Chunk { session, .. }
+        | Ask::Verify { session }
+        | Ask::Activate { session, .. }
+        | Ask::Abort { session, .. } = ask
+        {
+            self.of_session(*session, now_us)?;
+        }
         match ask {
-            // It was answered before.
-            Ask::Hello => {}
+            // One was answered before, the other is looked at when it is done.
+            Ask::Hello | Ask::Verify { .. } => {}
             Ask::Begin { session: id, release, signature } => {
-                let same = self.slots.update() == Some(*release);
+                let same = self.slots.is_of(release);
                 match &self.session {
                     Some(session) if session.id != *id => return Err(Refused::InUse),
                     // The answer was lost.
@@ -1008,13 +993,12 @@ where
                     BeginError::Length { room, .. } => Refused::Length { room },
                     BeginError::BelowFloor { floor, .. } => Refused::BelowFloor { floor },
                     BeginError::AnotherRobot { .. } => {
-                        Refused::AnotherRobot { robot: robot(self.identity.robot) }
+                        Refused::AnotherRobot { robot: self.slots.robot() }
                     }
                 })?;
                 self.signed(signature, now_us)?;
             }
-            Ask::Chunk { session, offset, bytes } => {
-                self.of_session(*session, now_us)?;
+            Ask::Chunk { offset, bytes, .. } => {
                 let release = self.slots.update().ok_or(Refused::NoSession)?;
                 let written = self.slots.written().ok_or(Refused::NoSession)?;
                 let room = release.length.saturating_sub(written);
@@ -1025,9 +1009,7 @@ where
                     return Ok(Some(Say::Written { written }));
                 }
             }
-            Ask::Verify { session } => self.of_session(*session, now_us)?,
-            Ask::Activate { session, signature } => {
-                self.of_session(*session, now_us)?;
+            Ask::Activate { signature, .. } => {
                 if self.resets {
                     return Ok(Some(Say::Activated));
                 }
@@ -1037,10 +1019,7 @@ where
                 self.may_confirm()?;
                 self.signed(signature, now_us)?;
             }
-            Ask::Abort { session, signature } => {
-                self.of_session(*session, now_us)?;
-                self.signed(signature, now_us)?;
-            }
+            Ask::Abort { signature, .. } => self.signed(signature, now_us)?,
         }
         Ok(None)
     }
@@ -1052,7 +1031,9 @@ where
         release: &Release,
         signature: &Signature,
     ) -> Result<(), Refused> {
-        if self.trust.accepts(&statement(purpose, release), signature) {
+        // Nothing has to be said where everybody is trusted.
+        if self.trust.key().is_none() || self.trust.accepts(&statement(purpose, release), signature)
+        {
             return Ok(());
         }
         // From when this call is over.
@@ -1067,17 +1048,17 @@ where
     }
 
     /// Does what takes long.
-    fn perform(&mut self, number: u8, ask: Ask) -> Result<Say, Refused> {
+    fn perform(&mut self, number: u8, ask: &Ask) -> Result<Say, Refused> {
         match ask {
             Ask::Hello => Err(Refused::Unknown { variant: crate::link::REQUEST }),
             Ask::Begin { session: id, release, signature } => {
-                self.check(Purpose::Install, &release, &signature)?;
-                self.session = Some(Session { id, heard_us: None });
-                if self.slots.update() == Some(release) && !self.slots.is_committed() {
+                self.check(Purpose::Install, release, signature)?;
+                self.session = Some(Session { id: *id, heard_us: None });
+                if self.slots.is_of(release) && !self.slots.is_committed() {
                     if let Some(written) = self.slots.written() {
                         return Ok(Say::Begun { written });
                     }
-                } else if self.slots.begin(&release).is_err() {
+                } else if self.slots.begin(release).is_err() {
                     // Checked when it arrived.
                     return Err(Refused::NoSession);
                 }
@@ -1085,7 +1066,7 @@ where
                 Ok(self.working())
             }
             Ask::Chunk { offset, bytes, .. } => {
-                self.slots.write(offset, &bytes).map_err(|error| match error {
+                self.slots.write(*offset, bytes).map_err(|error| match error {
                     WriteError::OutOfOrder { expected: written, .. } => {
                         Refused::OutOfOrder { written }
                     }
@@ -1115,7 +1096,7 @@ where
             }
             Ask::Activate { signature, .. } => {
                 let release = self.slots.update().ok_or(Refused::NotVerified)?;
-                self.check(Purpose::Activate, &release, &signature)?;
+                self.check(Purpose::Activate, &release, signature)?;
                 self.slots.commit().map_err(|error| match error {
                     MarkError::NotReady => Refused::NotVerified,
                     _ => Refused::Flash,
@@ -1127,7 +1108,7 @@ where
                 // Ticks may have come since.
                 self.may_confirm()?;
                 let release = self.release;
-                self.check(Purpose::Confirm, &release, &signature)?;
+                self.check(Purpose::Confirm, &release, signature)?;
                 self.slots.confirm().map_err(|error| match error {
                     MarkError::NotReady => Refused::NotOnTrial,
                     _ => Refused::Flash,
@@ -1136,7 +1117,7 @@ where
             }
             Ask::Abort { signature, .. } => {
                 let release = self.slots.update().ok_or(Refused::NoSession)?;
-                self.check(Purpose::Abort, &release, &signature)?;
+                self.check(Purpose::Abort, &release, signature)?;
                 self.drop_update()?;
                 Ok(Say::Aborted)
             }
@@ -1207,7 +1188,7 @@ where
             Job::Ask(Request { number, .. }) if mode == Mode::Running => {
                 (number, Err(Refused::Busy))
             }
-            Job::Ask(Request { number, ask }) => (number, self.perform(number, ask)),
+            Job::Ask(Request { number, ask }) => (number, self.perform(number, &ask)),
             // Whoever calls this has not held the robot yet.
             job @ Job::Erase(_) if mode != Mode::Safe => {
                 self.job = Some(job);

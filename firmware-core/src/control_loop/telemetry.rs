@@ -145,21 +145,13 @@ impl Frame {
     }
 
     /// As postcard writes it.
-    pub(crate) fn write<const C: usize>(&self, to: &mut Writer<C>) {
-        to.word(self.sequence);
-        to.long(self.time_us);
-        to.byte(self.mode as u8);
-        to.word(self.alarms.bits().into());
-        to.word(self.noticed.bits().into());
-        to.numbers(&self.applied);
-        for list in [&self.measured, &self.predicted, &self.residual] {
-            to.numbers(list);
-        }
-        to.word(self.steps);
-        to.word(self.bound_steps);
-        to.numbers(&self.ahead);
-        to.word(self.worst_tick_us);
-        to.word(self.dropped);
+    pub(crate) fn write(&self, to: &mut Writer<'_>) {
+        let to = to.word(self.sequence).long(self.time_us).byte(self.mode as u8);
+        let to = to.word(self.alarms.bits().into()).word(self.noticed.bits().into());
+        let to = to.numbers(&self.applied).numbers(&self.measured);
+        let to = to.numbers(&self.predicted).numbers(&self.residual);
+        let to = to.word(self.steps).word(self.bound_steps).numbers(&self.ahead);
+        to.word(self.worst_tick_us).word(self.dropped);
     }
 
     /// Takes the lists: a controller has this once, whatever loops it runs.

@@ -73,6 +73,14 @@ impl Run {
         }
     }
 
+    /// The place of a run among the shapes, or the number of them.
+    pub(super) const fn shape(radix: u8, count: u8) -> u8 {
+        match Self::new(radix, count) {
+            Some(run) => run.shape,
+            None => SHAPES.len() as u8,
+        }
+    }
+
     /// The longest run of the last factors; empty if the last one is not polynomial.
     #[inline(never)]
     pub(crate) fn last(factors: &[Factor]) -> Self {

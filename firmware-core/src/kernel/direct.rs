@@ -10,7 +10,7 @@ use crate::capacity::{MAX_BLOCK_FACTORS, REGISTERS};
 use crate::dictionary::{Factor, Observable, Source};
 use crate::history::LONG;
 use crate::model::Structure;
-use crate::registers::{FIRST, Kind, Layout, Place, Registers};
+use crate::registers::{FIRST, Kind, Layout, NOWHERE, Registers};
 
 /// Whether the only block of a dictionary takes the observables as they lie in the registers, one after the
 /// other, and no changes have to be kept.
@@ -43,7 +43,7 @@ impl Axes {
 
     /// Coefficients of an output.
     fn size(self) -> usize {
-        self.last.size().max(1).saturating_mul(self.others.size().max(1))
+        self.last.size().max(1).wrapping_mul(self.others.size().max(1))
     }
 
     #[inline(always)]
@@ -94,23 +94,17 @@ impl Next {
     #[inline(never)]
     fn of(layout: &Layout) -> Self {
         let (mut lines, mut register, mut in_order) = (0_u8, FIRST, true);
-        let mut follows = |own| {
-            let expected = register;
-            register = register.saturating_add(1);
-            expected == own
-        };
         for place in &layout.states {
-            in_order &= match place.kind {
-                Kind::Line => {
-                    lines = lines.saturating_add(1);
-                    follows(place.x)
-                }
-                Kind::Circle => follows(place.sin) && follows(place.cos),
-                _ => false,
+            let (first, count) = match place.kind {
+                // No angle is in front of it.
+                Kind::Line if register == FIRST.wrapping_add(lines) => (place.x, 1_u8),
+                Kind::Circle if place.cos == place.sin.wrapping_add(1) => (place.sin, 2),
+                _ => (NOWHERE, 0),
             };
+            in_order &= first == register;
+            register = register.wrapping_add(count);
+            lines = lines.wrapping_add(count & 1);
         }
-        let is_line = |place: &Place| place.kind == Kind::Line;
-        in_order &= layout.states.iter().take(lines.into()).all(is_line);
         match (layout.pose, layout.states.as_slice()) {
             _ if in_order => Self::Values(lines),
             (Some(pose), [_, _, heading])
@@ -146,17 +140,20 @@ impl Shape {
     /// `None` if it is another one.
     #[inline(never)]
     pub(crate) fn of(structure: &Structure<'_>, direct: &Direct) -> Option<Self> {
-        let of_runs = |last, inputs| {
-            (direct.all.last, direct.all.others.count(), direct.inputs) == (last, 0, inputs)
+        let of_runs = |last: u8, inputs: u8| {
+            direct.all.last.shape == last
+                && direct.all.others.count() == 0
+                && direct.inputs.shape == inputs
         };
         let layout = structure.layout();
         match (direct.next, layout.states.as_slice()) {
             // A further input that nothing observes would lie behind the others.
             (Next::Values(2), [_, _, _]) if layout.inputs() == 2 => {
-                of_runs(Run::new(2, 6)?, Run::new(2, 2)?).then_some(Self::Drive)
+                of_runs(const { Run::shape(2, 6) }, const { Run::shape(2, 2) })
+                    .then_some(Self::Drive)
             }
             (Next::Pose, [x, y, heading]) => {
-                let run = Run::new(4, 2)?;
+                let run = const { Run::shape(4, 2) };
                 let own = [x.x, y.x, heading.x, heading.sin, heading.cos];
                 let [low, high] = heading.limit;
                 let limited = low > -core::f32::consts::PI || high < core::f32::consts::PI;
@@ -245,7 +242,7 @@ impl Direct {
         let outputs = structure.outputs();
         self.outputs = outputs as u8;
         self.all.fill(factors);
-        let between = self.all.between().saturating_mul(outputs);
+        let between = self.all.between().wrapping_mul(outputs);
         if self.all.count() != factors.len() || between > free(factors, first) {
             self.all = Axes::default();
         }
@@ -261,8 +258,8 @@ impl Direct {
             factors.split_at_checked(factors.len().saturating_sub(inputs)).unwrap_or_default();
         self.states.fill(states);
         self.inputs = Run::last(inputs);
-        let left = self.states.size().saturating_add(self.states.between());
-        let room = left.saturating_mul(self.outputs.into());
+        let left = self.states.size().wrapping_add(self.states.between());
+        let room = left.wrapping_mul(self.outputs.into());
         let (of_states, of_inputs) = (self.states.count(), self.inputs.count());
         if (of_states, of_inputs) != (states.len(), inputs.len()) || room > free(factors, first) {
             (self.states, self.inputs) = (Axes::default(), Run::NONE);
@@ -428,7 +425,7 @@ impl Direct {
     pub(crate) fn folds(&self) -> [usize; 3] {
         let outputs = usize::from(self.outputs);
         let others = self.all.others;
-        let between = self.all.between().saturating_mul(outputs);
+        let between = self.all.between().wrapping_mul(outputs);
         let runs = if others.count() == 0 { 1 } else { 2 };
         let tiles = if runs == 1 { outputs } else { between.saturating_add(outputs) };
         let size = self.all.size();

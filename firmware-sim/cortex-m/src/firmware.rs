@@ -157,7 +157,7 @@ pub fn run(trust: impl Trust) -> Option<()> {
     if black_box(true) { rosbot(trust, Nowhere, goes_on) } else { leg(trust, Nowhere, goes_on) }
 }
 
-fn identity(
+const fn identity(
     robot: &'static str,
     factory: &'static [u8],
     capacities: Capacities,
@@ -228,9 +228,9 @@ pub fn rosbot<S: Read + ReadReady + Write + WriteReady>(
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut robot = rosbot_loop(&model, Telemetry::new(producer))?;
-    let capacities = Capacities::new::<3, 2>(100_000, 0);
-    let identity = identity("skid-rosbot", &ROSBOT.0, capacities);
-    serve(&mut robot, trust, identity, &mut frames, serial, goes_on)
+    static IDENTITY: Identity<'static> =
+        identity("skid-rosbot", &ROSBOT.0, Capacities::new::<3, 2>(100_000, 0));
+    serve(&mut robot, trust, &IDENTITY, &mut frames, serial, goes_on)
 }
 
 /// The leg.
@@ -245,23 +245,23 @@ pub fn leg<S: Read + ReadReady + Write + WriteReady>(
     let mut queue = Queue::<4>::new();
     let (producer, mut frames) = queue.split();
     let mut leg = leg_loop(&model, Telemetry::new(producer))?;
-    let capacities = Capacities::new::<2, 2>(50_000, 0);
-    let identity = identity("soft-leg", &LEG.0, capacities);
-    serve(&mut leg, trust, identity, &mut frames, serial, goes_on)
+    static IDENTITY: Identity<'static> =
+        identity("soft-leg", &LEG.0, Capacities::new::<2, 2>(50_000, 0));
+    serve(&mut leg, trust, &IDENTITY, &mut frames, serial, goes_on)
 }
 
 #[inline(never)]
 fn serve(
     robot: &mut dyn ControlLoop<2>,
     trust: impl Trust,
-    identity: Identity<'static>,
+    identity: &Identity<'static>,
     frames: &mut firmware_core::control_loop::telemetry::Frames<'_>,
     mut serial: impl Read + ReadReady + Write + WriteReady,
     mut goes_on: impl FnMut() -> bool,
 ) -> Option<()> {
     let geometry = Geometry { offset: 0, slot_bytes: 128 * 1024 };
     let accept = |payload: Payload| black_box(payload.length) > 0;
-    let booted = Updater::boot(Nowhere, geometry, identity, 0, trust, accept);
+    let booted = Updater::boot(Nowhere, geometry, *identity, 0, trust, accept);
     let (mut updater, _) = booted.ok()?;
     let mut port = Port::new();
     while goes_on() && !(updater.resets() && port.is_sent()) {

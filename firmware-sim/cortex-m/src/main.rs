@@ -25,6 +25,7 @@ mod host;
 mod machine;
 mod models;
 mod owner;
+mod vectors;
 
 use machine::count;
 use models::MODELS;
@@ -125,26 +126,38 @@ fn one(i: usize, blob: &[u8], per_tick: f32) -> Option<()> {
         input = inputs.next().unwrap_or(&[]);
     }
     let mut state = start.clone();
-    let repeat = |state: &mut PredictorState, work: fn(_, &mut _, _) -> bool| {
-        let mut good = true;
-        let ticks = count(|| {
-            for _ in 0..REPETITIONS {
-                state.clone_from(black_box(&start));
-                good &= work(&predictor, state, input);
-            }
-        });
-        (ticks, good)
-    };
-    let (with, good) = repeat(&mut state, black_box(step));
+    let (with, good) = repeated(&predictor, &start, &mut state, input, black_box(step));
     if !good || state.out_of_range().is_some() {
         hprintln!("{} not in range", i);
         return None;
     }
-    let (without, _) = repeat(&mut state, black_box(nothing));
-    // What `nothing` costs itself (a move and a return) goes with the call of the step.
-    let instructions = (with - without) as f32 * per_tick / REPETITIONS as f32;
+    let (without, _) = repeated(&predictor, &start, &mut state, input, black_box(nothing));
+    // What `nothing` does, a move and a return, is taken off as well: the return is one of the step, too, and the
+    // move goes with its call.
+    let instructions = 1.0 + (with - without) as f32 * per_tick / REPETITIONS as f32;
     hprintln!("{} {} {:.1} {}", i, structure.robot(), instructions, blob.len());
     Some(())
+}
+
+type Work = fn(&Predictor<'_, '_>, &mut PredictorState, &[f32]) -> bool;
+
+/// Ticks that some work takes from a state, time and again, and whether it was always done.
+#[inline(never)]
+fn repeated(
+    predictor: &Predictor<'_, '_>,
+    start: &PredictorState,
+    state: &mut PredictorState,
+    input: &[f32],
+    work: Work,
+) -> (u32, bool) {
+    let mut good = true;
+    let ticks = count(|| {
+        for _ in 0..REPETITIONS {
+            state.clone_from(black_box(start));
+            good &= work(predictor, state, input);
+        }
+    });
+    (ticks, good)
 }
 
 #[inline(never)]

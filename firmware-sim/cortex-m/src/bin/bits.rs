@@ -23,6 +23,8 @@ mod machine;
 mod models;
 #[path = "../shapes.rs"]
 mod shapes;
+#[path = "../vectors.rs"]
+mod vectors;
 
 use models::MODELS;
 

@@ -9,6 +9,9 @@ use cortex_m_rt::entry;
 use firmware_core::blob::Aligned;
 use firmware_core::{Predictor, PredictorState};
 
+#[path = "../vectors.rs"]
+mod vectors;
+
 static BLOB: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../../models/rosbot/model.bin"));
 
 #[panic_handler]

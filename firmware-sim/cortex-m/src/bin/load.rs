@@ -24,6 +24,8 @@ use firmware_core::{Model, ModelRepr, PredictorState, Structure};
 mod machine;
 #[path = "../models.rs"]
 mod models;
+#[path = "../vectors.rs"]
+mod vectors;
 
 use machine::{count, stack};
 use models::MODELS;

@@ -8,6 +8,8 @@ use firmware_core::update::Anyone;
 
 #[path = "../firmware.rs"]
 mod firmware;
+#[path = "../vectors.rs"]
+mod vectors;
 
 #[panic_handler]
 fn panic(_: &core::panic::PanicInfo<'_>) -> ! {

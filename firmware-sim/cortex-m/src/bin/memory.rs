@@ -24,6 +24,8 @@ mod firmware;
 mod machine;
 #[path = "../owner.rs"]
 mod owner;
+#[path = "../vectors.rs"]
+mod vectors;
 
 use owner::{KEY, SIGNED};
 

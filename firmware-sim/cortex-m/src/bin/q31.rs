@@ -23,6 +23,8 @@ mod bits;
 mod host;
 #[path = "../machine.rs"]
 mod machine;
+#[path = "../vectors.rs"]
+mod vectors;
 
 use machine::count;
 

@@ -45,6 +45,8 @@ mod plant;
 mod plant_line;
 #[path = "../slots_in_ram.rs"]
 mod slots_in_ram;
+#[path = "../vectors.rs"]
+mod vectors;
 
 use board::{CORE_HZ, Clock, MACHINE, Serial};
 use plant::Plant;

@@ -20,6 +20,8 @@ use firmware_core::control_loop::{Command, ControlLoop, Mode, Telemetry};
 mod firmware;
 #[path = "../machine.rs"]
 mod machine;
+#[path = "../vectors.rs"]
+mod vectors;
 
 use machine::count;
 
