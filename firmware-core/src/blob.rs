@@ -443,7 +443,7 @@ fn load<'a>(
         loaded = model.lay_out();
     }
     if loaded.is_ok() {
-        model.shorten();
+        model.complete();
         loaded = take_numbers(&sections, model);
     }
     if loaded.is_ok() {

@@ -180,21 +180,22 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// Bytes that are written one after the other. What has no room is missing, and [`written`](Self::written)
-/// says so in the end: no field has to be checked.
-pub(crate) struct Writer<'a> {
-    bytes: &'a mut [u8],
+/// Bytes that are written one after the other to where they are to lie. What has no room is missing, and
+/// [`end`](Self::end) says so: no field has to be checked.
+pub(crate) struct Writer<'w> {
+    bytes: &'w mut [u8],
     length: usize,
 }
 
-impl<'a> Writer<'a> {
-    pub(crate) fn new(bytes: &'a mut [u8]) -> Self {
-        Self { bytes, length: 0 }
+impl<'w> Writer<'w> {
+    /// Behind the first `length` bytes, which stay.
+    pub(crate) fn behind(bytes: &'w mut [u8], length: usize) -> Self {
+        Self { bytes, length }
     }
 
-    /// All bytes, unless some had no room.
-    pub(crate) fn written(&self) -> Option<&[u8]> {
-        self.bytes.get(..self.length)
+    /// The end of what was written, unless some had no room.
+    pub(crate) fn end(self) -> Option<usize> {
+        Some(self.length).filter(|length| *length <= self.bytes.len())
     }
 
     // Each gives the writer back: the next one finds it where it is.

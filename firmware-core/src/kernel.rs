@@ -32,10 +32,10 @@ use heapless::Vec;
 // Sizes of a checked dictionary are small numbers: the wrapping arithmetic below never wraps, and is
 // there because it cannot panic.
 
-use crate::capacity::{MAX_FUNCTIONS, MAX_OBSERVABLES, MAX_SPARSE_TERMS, REGISTERS};
+use crate::capacity::{MAX_FUNCTIONS, MAX_SPARSE_TERMS, REGISTERS};
 use crate::dictionary::{Basis, DictionaryError, Factor, Observable, observable_pair, turn};
 use crate::model::{ModelError, Structure};
-use crate::registers::{FIRST, Layout, NOWHERE, ONE, Registers};
+use crate::registers::{Layout, NOWHERE, ONE, Registers};
 use crate::sparse::{SparseError, SparseTerms};
 use crate::{Number, Scalar};
 
@@ -97,15 +97,7 @@ pub(crate) fn chain<S: Number>(entries: &[[u8; 2]], functions: &[S], terms: &mut
     }
 }
 
-/// A Fourier factor of a sparse model: the registers of sine and cosine, and the order, 2 or more.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Harmonics {
-    sin: u8,
-    cos: u8,
-    order: u8,
-}
-
-/// Outputs that are summed while the terms are made.
+/// Outputs that are summed while the terms are made, at most.
 const TOGETHER: usize = 4;
 
 /// The terms, and the sums of their products with the coefficients of each output.
@@ -117,10 +109,11 @@ pub(crate) fn terms<S: Scalar>(
     outputs: &mut [S],
 ) {
     let get = |register: u8| registers.get(usize::from(register)).map_or(S::ZERO, Cell::get);
+    let made = made.get(..products.len()).unwrap_or(&[]);
     for ([a, b], to) in products.iter().zip(made) {
         to.set(get(*a) * get(*b));
     }
-    sums(made, coefficients, outputs);
+    sums(made, coefficients, outputs.get_mut(..TOGETHER.min(outputs.len())).unwrap_or_default());
 }
 
 /// The sums of the products of terms with the coefficients of each output.
@@ -138,17 +131,24 @@ fn sums<S: Scalar>(terms: &[Cell<S>], coefficients: &[S], outputs: &mut [S]) {
 /// 2. harmonics of a sparse model from the second on, then its powers from the second on, then its
 ///    terms without the constant.
 ///
-/// Powers and terms are products of two registers.
+/// No entry makes less than a register, so that there is room for as many together as there are registers.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Program {
     /// The first register that is computed.
     first: u8,
-    /// Observables with a register of their own: index, and register of the raw value.
-    scaled: Vec<[u8; 2], MAX_OBSERVABLES>,
-    harmonics: Vec<Harmonics, { MAX_FUNCTIONS / 4 }>,
-    products: Vec<[u8; 2], { REGISTERS - FIRST as usize }>,
-    /// Products that are powers, and not terms.
+    /// The register of the first term.
+    first_term: u8,
+    /// Where the harmonics, the powers and the terms begin among the entries, and where these end.
+    harmonics: u8,
     powers: u8,
+    terms: u8,
+    end: u8,
+    /// Terms.
+    count: u8,
+    /// Of observables with a register of their own: index, and register of the raw value. Of the harmonics
+    /// of a factor, order 2 or more, two entries: registers of sine and cosine; order, and nothing. Of powers and
+    /// terms the two registers whose product they are.
+    entries: [[u8; 2]; REGISTERS],
     /// What makes the step of some dense models short.
     direct: Direct,
 }
@@ -166,27 +166,50 @@ impl Program {
     pub(crate) const fn empty() -> Self {
         Self {
             first: 0,
-            scaled: Vec::new(),
-            harmonics: Vec::new(),
-            products: Vec::new(),
+            first_term: 0,
+            harmonics: 0,
             powers: 0,
+            terms: 0,
+            end: 0,
+            count: 0,
+            entries: [[0; 2]; REGISTERS],
             direct: Direct::empty(),
         }
     }
 
     pub(crate) fn clear(&mut self) {
-        (self.first, self.powers) = (0, 0);
-        self.scaled.clear();
-        self.harmonics.clear();
-        self.products.clear();
+        (self.first, self.first_term, self.end) = (0, 0, 0);
+        (self.harmonics, self.powers, self.terms, self.count) = (0, 0, 0, 0);
+        self.entries.fill([0; 2]);
         self.direct.clear();
+    }
+
+    /// An entry. There are as many as bytes, so that this needs no check.
+    #[inline(always)]
+    fn entry(&self, index: u8) -> [u8; 2] {
+        self.entries.get(usize::from(index)).copied().unwrap_or_default()
+    }
+
+    /// Observables with a register of their own.
+    #[inline(always)]
+    fn scaled(&self) -> &[[u8; 2]] {
+        self.entries.get(..self.harmonics.into()).unwrap_or(&[])
+    }
+
+    /// Puts an entry behind the others, if there is room.
+    #[inline(never)]
+    fn put(&mut self, entry: [u8; 2]) {
+        let place = self.entries.get_mut(usize::from(self.end));
+        place.into_iter().for_each(|place| *place = entry);
+        self.end = self.end.saturating_add(1);
     }
 
     /// The register of an observable.
     #[inline(never)]
     fn observed(&self, layout: &Layout, observable: u8) -> u8 {
         // They are in order, so that it cannot be further behind.
-        let own = self.scaled.get(..=usize::from(observable)).unwrap_or(&self.scaled);
+        let scaled = self.scaled();
+        let own = scaled.get(..=usize::from(observable)).unwrap_or(scaled);
         match own.iter().rposition(|[index, _]| *index == observable) {
             Some(place) => self.first.saturating_add(place as u8),
             None => layout.observables.get(usize::from(observable)).copied().unwrap_or(NOWHERE),
@@ -195,6 +218,8 @@ impl Program {
 
     /// Becomes that of a structure and the terms that have been checked against its dictionary. It is
     /// made where it lies: on the stack it would take a kilobyte.
+    ///
+    /// The [rest](Self::complete) follows: in parts, so that little is on the stack at once.
     #[inline(never)]
     pub(crate) fn fill<E: From<ModelError>>(
         &mut self,
@@ -207,10 +232,11 @@ impl Program {
         let observables = dictionary.observables().iter().zip(&layout.observables);
         for (index, (o, register)) in observables.enumerate() {
             if terms.is_none() || (o.centre, o.gain) != (0.0, 1.0) {
-                let _ = self.scaled.push([index as u8, *register]);
+                self.put([index as u8, *register]);
             }
         }
-        let mut next = usize::from(self.first).wrapping_add(self.scaled.len());
+        self.harmonics = self.end;
+        let mut next = usize::from(self.first).wrapping_add(self.harmonics.into());
         let Some(terms) = terms else {
             return if next <= REGISTERS {
                 Ok(())
@@ -221,41 +247,52 @@ impl Program {
             };
         };
         let factors = dictionary.factors();
-        let first_harmonic = next;
         for factor in factors.iter().filter(|f| f.basis == Basis::Fourier && f.order > 1) {
             let (sin, cos) = (
                 self.observed(layout, factor.observable),
                 self.observed(layout, factor.observable.saturating_add(1)),
             );
             let order = factor.order;
-            let _ = self.harmonics.push(Harmonics { sin, cos, order });
+            self.put([sin, cos]);
+            self.put([order, NOWHERE]);
             next = next.wrapping_add(usize::from(order).wrapping_sub(1).wrapping_mul(2));
         }
-        let first_power = next;
+        self.powers = self.end;
         for factor in factors.iter().filter(|f| f.basis == Basis::Hermite) {
             let v = self.observed(layout, factor.observable);
             let mut power = v;
             for _ in 1..factor.order {
-                let _ = self.products.push([power, v]);
+                self.put([power, v]);
                 power = byte(next);
                 next = next.wrapping_add(1);
             }
         }
-        self.powers = self.products.len() as u8;
+        self.terms = self.end;
         let first_term = next;
+        self.first_term = byte(next);
         for [parent, _] in terms.entries() {
             let parent = match parent.checked_sub(1) {
                 None => ONE,
                 Some(earlier) => byte(first_term.wrapping_add(earlier.into())),
             };
             // The register of its function follows.
-            let _ = self.products.push([parent, NOWHERE]);
+            self.put([parent, NOWHERE]);
             next = next.wrapping_add(1);
         }
         if next > REGISTERS {
             let (field, capacity, found) = ("registers", REGISTERS, next);
             return Err(ModelError::Sparse(SparseError::TooLarge { field, capacity, found }).into());
         }
+        self.count = self.end.saturating_sub(self.terms);
+        Ok(())
+    }
+
+    /// The registers of the terms' functions.
+    #[inline(never)]
+    fn fill_functions(&mut self, structure: &Structure<'_>, terms: SparseTerms<'_>) {
+        let (layout, dictionary) = (structure.layout(), structure.dictionary());
+        let first_harmonic = self.first.wrapping_add(self.harmonics);
+        let first_power = self.first_term.wrapping_sub(self.terms.wrapping_sub(self.powers));
         // Some functions at a time: the registers of all would be half of what loading takes of the stack.
         let (mut from, functions) = (0_usize, dictionary.functions());
         while from < functions {
@@ -263,7 +300,7 @@ impl Program {
             // Where a function belongs: out of bounds where it is not among those of the table.
             let mut place = 0_usize.wrapping_sub(from);
             let (mut harmonic, mut power) = (first_harmonic, first_power);
-            for factor in factors {
+            for factor in dictionary.factors() {
                 // What is observed, and behind it what is computed.
                 let (next, observed) = match factor.basis {
                     Basis::Hermite => (&mut power, 1),
@@ -274,7 +311,7 @@ impl Program {
                         let behind = digit.wrapping_sub(1) as u8;
                         self.observed(layout, factor.observable.wrapping_add(behind))
                     } else {
-                        let register = byte(*next);
+                        let register = *next;
                         *next = next.wrapping_add(1);
                         register
                     };
@@ -284,7 +321,7 @@ impl Program {
                     place = place.wrapping_add(1);
                 }
             }
-            let of_terms = self.products.get_mut(self.powers.into()..).unwrap_or_default();
+            let of_terms = self.entries.get_mut(self.terms.into()..).unwrap_or_default();
             for ([_, register], [_, function]) in of_terms.iter_mut().zip(terms.entries()) {
                 if let Some(found) = table.get(usize::from(*function).wrapping_sub(from)) {
                     *register = *found;
@@ -292,13 +329,15 @@ impl Program {
             }
             from = from.wrapping_add(TABLE);
         }
-        Ok(())
     }
 
-    /// What makes the step of some dense models short, once it is filled.
+    /// Once it is filled: the functions of a sparse model's terms, or what makes the step of some dense models short.
     #[inline]
-    pub(crate) fn shorten(&mut self, structure: &Structure<'_>) {
-        self.direct.fill(structure, self.first);
+    pub(crate) fn complete(&mut self, structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) {
+        match terms {
+            Some(terms) => self.fill_functions(structure, terms),
+            None => self.direct.fill(structure, self.first),
+        }
     }
 
     /// How a step gets by without looking at each observable.
@@ -326,20 +365,21 @@ impl Program {
         observables: &[Observable],
         registers: &mut Registers<S>,
     ) -> u8 {
-        let mut next = self.first;
-        for [index, raw] in &self.scaled {
+        let cells = registers.cells();
+        let own = cells.get(usize::from(self.first)..).unwrap_or(&[]);
+        for ([index, raw], to) in self.scaled().iter().zip(own) {
+            let raw = cells.get(usize::from(*raw)).map_or(S::ZERO, Cell::get);
             if let Some(o) = observables.get(usize::from(*index)) {
-                registers.set(next, o.value(registers.get(*raw)));
+                to.set(o.value(raw));
             }
-            next = next.wrapping_add(1);
         }
-        next
+        self.first.wrapping_add(self.harmonics)
     }
 
     /// The values of all observables of a dense model, which have been scaled.
     #[inline]
     pub(crate) fn values<'r, S: Scalar>(&self, registers: &'r Registers<S>) -> &'r [S] {
-        registers.slice(self.first, self.scaled.len())
+        registers.slice(self.first, self.harmonics.into())
     }
 
     /// The outputs of a sparse model, whose observables have been scaled up to register `next`:
@@ -353,29 +393,32 @@ impl Program {
         outputs: &mut [S],
     ) {
         let mut next = next;
-        for Harmonics { sin, cos, order } in &self.harmonics {
-            let first = (registers.get(*sin), registers.get(*cos));
+        let mut index = self.harmonics;
+        while index < self.powers {
+            let ([sin, cos], [order, _]) = (self.entry(index), self.entry(index.wrapping_add(1)));
+            let first = (registers.get(sin), registers.get(cos));
             let mut harmonic = first;
-            for _ in 1..*order {
+            for _ in 1..order {
                 harmonic = turn(harmonic, first);
                 registers.set(next, harmonic.0);
                 registers.set(next.wrapping_add(1), harmonic.1);
                 next = next.wrapping_add(2);
             }
+            index = index.saturating_add(2);
         }
-        let (powers, terms) =
-            self.products.split_at_checked(self.powers.into()).unwrap_or_default();
-        for [a, b] in powers {
-            registers.set(next, registers.get(*a) * registers.get(*b));
-            next = next.wrapping_add(1);
-        }
+        let (powers, terms) = (self.powers.into(), self.terms.into());
         let cells = registers.cells();
-        let made = cells.get(usize::from(next)..).and_then(|made| made.get(..terms.len()));
-        let made = made.unwrap_or(&[]);
-        let (first, others) =
-            outputs.split_at_mut_checked(TOGETHER.min(outputs.len())).unwrap_or_default();
-        S::terms(cells, terms, made, coefficients, first);
-        if !others.is_empty() {
+        let get = |register: u8| cells.get(usize::from(register)).map_or(S::ZERO, Cell::get);
+        let made = cells.get(usize::from(next)..).unwrap_or(&[]);
+        for ([a, b], to) in self.entries.get(powers..terms).unwrap_or(&[]).iter().zip(made) {
+            to.set(get(*a) * get(*b));
+        }
+        let made = cells.get(usize::from(self.first_term)..).unwrap_or(&[]);
+        let terms = self.entries.get(terms..).unwrap_or(&[]);
+        let terms = terms.get(..self.count.into()).unwrap_or(&[]);
+        S::terms(cells, terms, made, coefficients, outputs);
+        if let Some(others) = outputs.get_mut(TOGETHER..) {
+            let made = made.get(..terms.len()).unwrap_or(&[]);
             let before = made.len().wrapping_add(1).wrapping_mul(TOGETHER);
             sums(made, coefficients.get(before..).unwrap_or(&[]), others);
         }

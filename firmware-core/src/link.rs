@@ -26,7 +26,7 @@
 //! The whole, byte by byte: docs/protocol.md.
 
 use embedded_io::{Read, ReadReady, Write, WriteReady};
-use heapless::{Deque, Vec};
+use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::crc32;
@@ -34,11 +34,16 @@ use crate::capacity::MAX_INPUTS;
 use crate::control_loop::telemetry::{Frame, Frames};
 use crate::control_loop::{Command, ControlLoop, Mode};
 use crate::encoding::{Reader, Writer};
-use crate::update::{Answer, Ask, Refused, Request, Say, Updates};
+use crate::update::{Answer, Answers, Ask, Refused, Request, Updates};
 
 /// Longest frame on the line, the final zero included: a telemetry frame with lists as long as there is
-/// room for takes 204 bytes, the longest chunk of a blob 213.
+/// room for takes 206 bytes, the longest chunk of a blob 213.
 pub const MAX_FRAME: usize = 256;
+/// Where a message begins in a frame that is made in place: behind the first code byte of COBS, which is the
+/// only one besides its zeros, as long as it is shorter than 254 bytes.
+const BODY: usize = 1;
+/// Longest frame that a controller sends: one of telemetry. The longest answer takes 171 bytes.
+const MAX_SENT: usize = 206;
 /// Number of [`Message::Inputs`].
 const INPUTS: u8 = 3;
 /// Number of [`Message::Frame`].
@@ -111,21 +116,29 @@ impl Message {
 /// # Errors
 /// [`TooLong`] when `out` has no room for it; [`MAX_FRAME`] bytes always are enough.
 pub fn encode(message: &Message, out: &mut [u8]) -> Result<usize, TooLong> {
-    let mut plain = [0; MAX_FRAME];
-    let mut bytes = [0; MAX_FRAME];
-    let mut writer = Writer::new(&mut bytes);
-    writer.array(postcard::to_slice(message, &mut plain).map_err(|_| TooLong)?);
-    frame(&mut writer, out)
+    let message = postcard::to_slice(message, out.get_mut(BODY..).ok_or(TooLong)?);
+    let end = BODY.saturating_add(message.map_err(|_| TooLong)?.len());
+    frame(out, end)
 }
 
-/// The frame of a message: its checksum behind it, the whole stuffed, and the final zero.
+/// Makes a frame of the message that lies in `out` from [`BODY`] to `end`: its checksum behind it, the whole
+/// stuffed in place, and the final zero. Its length.
 #[inline(never)]
-fn frame(message: &mut Writer<'_>, out: &mut [u8]) -> Result<usize, TooLong> {
-    let check = crc32(0, message.written().ok_or(TooLong)?);
-    message.array(&check.to_le_bytes());
-    let stuffed = cobs::try_encode(message.written().ok_or(TooLong)?, out).map_err(|_| TooLong)?;
-    *out.get_mut(stuffed).ok_or(TooLong)? = 0;
-    Ok(stuffed.saturating_add(1))
+fn frame(out: &mut [u8], end: usize) -> Result<usize, TooLong> {
+    let check = crc32(0, out.get(BODY..end).ok_or(TooLong)?);
+    let mut writer = Writer::behind(out, end);
+    writer.array(&check.to_le_bytes());
+    writer.byte(0);
+    let length = writer.end().filter(|length| *length <= MAX_FRAME).ok_or(TooLong)?;
+    // Every zero becomes the distance to the next one, the byte in front the distance to the first.
+    let mut distance = 0_u8;
+    for (i, byte) in out.iter_mut().enumerate().take(length).rev() {
+        if *byte == 0 || i == 0 {
+            (*byte, distance) = (distance, 0);
+        }
+        distance = distance.saturating_add(1);
+    }
+    Ok(length)
 }
 
 /// A message has no room.
@@ -243,6 +256,7 @@ enum Incoming<const M: usize> {
 }
 
 impl<const M: usize> Incoming<M> {
+    #[inline(never)]
     fn read(body: &[u8], request: &mut Request) -> Self {
         let mut reader = Reader::new(body);
         let read = match reader.variant(256) as u8 {
@@ -272,8 +286,6 @@ impl<const M: usize> Incoming<M> {
 
 /// Reads at most this many bytes per call: bounded work, whatever the line brings.
 const READ: usize = 128;
-/// Answers that wait to be sent; further ones are dropped, as the host asks again.
-const ANSWERS: usize = 2;
 /// What updates have to do waits at most so long until answers are on the line (µs).
 const SENT_US: u64 = 1_000_000;
 
@@ -281,9 +293,9 @@ const SENT_US: u64 = 1_000_000;
 #[derive(Clone, Debug)]
 pub struct Port {
     receiver: Receiver,
-    answers: Deque<Answer, ANSWERS>,
+    answers: Answers,
     /// The frame that is being sent, its length and how much of it is on the way.
-    out: [u8; MAX_FRAME],
+    out: [u8; MAX_SENT],
     length: usize,
     sent: usize,
     /// Whether the last one was an answer: then it is the turn of a frame, however much is asked.
@@ -304,8 +316,8 @@ impl Port {
     pub fn new() -> Self {
         Self {
             receiver: Receiver::new(),
-            answers: Deque::new(),
-            out: [0; MAX_FRAME],
+            answers: Answers::new(),
+            out: [0; MAX_SENT],
             length: 0,
             sent: 0,
             answered: false,
@@ -321,7 +333,7 @@ impl Port {
 
     /// Whether all answers have been handed to the line. Of telemetry there may always be more.
     pub fn is_sent(&self) -> bool {
-        self.answers.is_empty() && (self.sent == self.length || !self.answered)
+        self.answers.first().is_none() && (self.sent == self.length || !self.answered)
     }
 
     /// Reads what has arrived, at most 128 bytes, and hands on commands to the loop, requests to the
@@ -336,6 +348,26 @@ impl Port {
         updates: &mut impl Updates,
         now_us: u64,
     ) {
+        self.listen(serial, robot, updates, now_us);
+        if !updates.is_working() {
+            self.works_since_us = None;
+        } else if self.is_time_to_work(robot, now_us) {
+            self.works_since_us = None;
+            updates.work(robot.mode(), now_us, &mut self.answers);
+            robot.supervisor_mut().pause();
+        }
+        robot.supervisor_mut().hold(updates.holds(now_us));
+    }
+
+    /// Reads what has arrived.
+    #[inline(never)]
+    fn listen<const M: usize>(
+        &mut self,
+        serial: &mut (impl Read + ReadReady),
+        robot: &mut (impl ControlLoop<M> + ?Sized),
+        updates: &mut impl Updates,
+        now_us: u64,
+    ) {
         let mut bytes = [0; READ];
         let count = match serial.read_ready() {
             Ok(true) => serial.read(&mut bytes).unwrap_or(0),
@@ -343,29 +375,20 @@ impl Port {
         };
         for byte in bytes.iter().take(count) {
             let Some(body) = self.receiver.complete(*byte) else { continue };
-            let (is_done, answer) = match body {
-                Ok(body) => take(body, robot, updates, now_us),
+            let is_done = match body {
+                Ok(body) => take(body, robot, updates, now_us, &mut self.answers),
                 Err(Unframed::TooLong) => {
                     let most = u32::try_from(MAX_FRAME).unwrap_or(u32::MAX);
-                    (false, refused(0, Refused::TooLong { most }))
+                    self.answers.refuse(0, Refused::TooLong { most });
+                    false
                 }
                 // Whoever sent it will see that nothing comes back.
-                Err(Unframed::Damaged) => (false, None),
+                Err(Unframed::Damaged) => false,
             };
             if !is_done {
                 self.damaged = self.damaged.saturating_add(1);
             }
-            self.answer(answer);
         }
-        if !updates.is_working() {
-            self.works_since_us = None;
-        } else if self.is_time_to_work(robot, now_us) {
-            self.works_since_us = None;
-            let answer = updates.work(robot.mode(), now_us);
-            self.answer(answer);
-            robot.supervisor_mut().pause();
-        }
-        robot.supervisor_mut().hold(updates.holds(now_us));
     }
 
     fn is_time_to_work<const M: usize>(
@@ -383,13 +406,6 @@ impl Port {
         robot.supervisor().is_switched_off() && (self.is_sent() || !is_patient)
     }
 
-    #[inline(never)]
-    fn answer(&mut self, answer: Option<Answer>) {
-        if let Some(answer) = answer {
-            let _ = self.answers.push_back(answer);
-        }
-    }
-
     /// Sends as much of the waiting answers and frames as the line takes now: the rest of the one on the
     /// way, and at most one more.
     #[inline(never)]
@@ -397,15 +413,14 @@ impl Port {
         for _ in 0..2 {
             if self.sent == self.length {
                 let waits = self.answered && frames.ready();
-                let answer = self.answers.front().filter(|_| !waits);
+                let answer = if waits { None } else { self.answers.first() };
                 self.answered = answer.is_some();
-                let mut bytes = [0; MAX_FRAME];
-                let mut message = Writer::new(&mut bytes);
-                // They are written where they lie.
+                let mut message = Writer::behind(&mut self.out, BODY);
+                // Written where they lie, and dropped then.
                 if let Some(answer) = answer {
                     message.byte(ANSWER);
                     answer.write(&mut message);
-                    let _ = self.answers.pop_front();
+                    let _ = self.answers.take();
                 } else if let Some(frame) = frames.peek() {
                     message.byte(FRAME);
                     frame.write(&mut message);
@@ -415,7 +430,8 @@ impl Port {
                 }
                 self.sent = 0;
                 // There is room for every message.
-                self.length = frame(&mut message, &mut self.out).unwrap_or(0);
+                let end = message.end().unwrap_or(0);
+                self.length = frame(&mut self.out, end).unwrap_or(0);
             }
             while let Some(rest) = self.out.get(self.sent..self.length).filter(|r| !r.is_empty()) {
                 if !matches!(serial.write_ready(), Ok(true)) {
@@ -433,28 +449,29 @@ impl Port {
     }
 }
 
-fn refused(number: u8, refused: Refused) -> Option<Answer> {
-    Some(Answer { number, say: Say::Refused(refused) })
-}
-
-/// Does what was received: whether it could be done, and the answer.
+/// Does what was received, and answers; whether it could be done.
 #[inline(never)]
 fn take<const M: usize>(
     body: &[u8],
     robot: &mut (impl ControlLoop<M> + ?Sized),
     updates: &mut impl Updates,
     now_us: u64,
-) -> (bool, Option<Answer>) {
+    answers: &mut Answers,
+) -> bool {
     let mut request = Request { number: 0, ask: Ask::Hello };
     match Incoming::read(body, &mut request) {
         Incoming::Command(command) => {
             robot.command(command);
-            (true, None)
+            true
         }
-        Incoming::Request => (true, updates.receive(request, robot.mode(), now_us)),
-        Incoming::ForHost => (false, None),
+        Incoming::Request => {
+            updates.receive(request, robot.mode(), now_us, answers);
+            true
+        }
+        Incoming::ForHost => false,
         Incoming::Unknown { variant, number } => {
-            (false, refused(number, Refused::Unknown { variant }))
+            answers.refuse(number, Refused::Unknown { variant });
+            false
         }
     }
 }
@@ -463,6 +480,7 @@ fn take<const M: usize>(
 mod tests {
     extern crate std;
     use super::*;
+    use crate::update::Say;
     use proptest::prelude::*;
 
     fn full() -> Message {
@@ -471,8 +489,8 @@ mod tests {
             sequence: u32::MAX,
             time_us: u64::MAX,
             mode: Mode::Safe,
-            alarms: crate::control_loop::Alarms::SAFE,
-            noticed: crate::control_loop::Alarms::SAFE,
+            alarms: crate::control_loop::Alarms::TELLING,
+            noticed: crate::control_loop::Alarms::TELLING,
             applied: numbers.into_iter().take(MAX_INPUTS).collect(),
             measured: numbers.into_iter().collect(),
             predicted: numbers.into_iter().collect(),
@@ -494,7 +512,7 @@ mod tests {
     fn the_largest_frame_has_room() {
         let mut out = [0; MAX_FRAME];
         let length = encode(&full(), &mut out).unwrap();
-        assert_eq!(length, 204, "see MAX_FRAME");
+        assert_eq!(length, MAX_SENT, "see MAX_FRAME");
         assert_eq!(receive(&out[..length]), [Received::Message(full())]);
     }
 
@@ -722,10 +740,11 @@ mod tests {
 
     fn written(variant: u8, write: impl FnOnce(&mut Writer<'_>)) -> std::vec::Vec<u8> {
         let mut bytes = [0; MAX_FRAME];
-        let mut writer = Writer::new(&mut bytes);
+        let mut writer = Writer::behind(&mut bytes, 0);
         writer.byte(variant);
         write(&mut writer);
-        writer.written().unwrap().to_vec()
+        let length = writer.end().unwrap();
+        bytes[..length].to_vec()
     }
 
     fn as_serde_writes(message: &Message) -> std::vec::Vec<u8> {

@@ -675,7 +675,7 @@ impl<'a, S: Scalar> Model<'a, S> {
     ) -> Result<(), ModelError> {
         self.take_terms(terms)?;
         self.lay_out::<ModelError>()?;
-        self.shorten();
+        self.complete();
         self.take_numbers(coefficients, ranges)
     }
 
@@ -692,12 +692,10 @@ impl<'a, S: Scalar> Model<'a, S> {
         self.program.fill(&self.structure, self.terms)
     }
 
-    /// What makes the step of some dense models short, once the registers are known.
+    /// The rest of the program, once the registers are known.
     #[inline]
-    pub(crate) fn shorten(&mut self) {
-        if self.terms.is_none() {
-            self.program.shorten(&self.structure);
-        }
+    pub(crate) fn complete(&mut self) {
+        self.program.complete(&self.structure, self.terms);
     }
 
     /// Coefficients and trained ranges of a model with its terms. Error bounds come later.

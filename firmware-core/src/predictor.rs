@@ -356,11 +356,6 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         take_input(layout, state, input)?;
         let registers = state.history.registers_mut();
         let (dictionary, coefficients) = (structure.dictionary(), self.model.coefficients());
-        let ranges = self.model.range_pairs();
-        let mut outside = 0;
-        for (register, [low, high]) in layout.observables.iter().zip(ranges) {
-            outside |= registers.get(*register).outside(*low, *high);
-        }
         let outputs = state.outputs.get_mut(..structure.outputs()).unwrap_or_default();
         let next = program.scale(dictionary.observables(), registers);
         if self.model.terms().is_some() {
@@ -372,6 +367,12 @@ impl<'m, 'a, S: Scalar> Predictor<'m, 'a, S> {
         }
         stage(state, layout, structure.outputs())?;
         let step = state.step.saturating_add(1);
+        // What is observed is still there.
+        let (ranges, registers) = (self.model.range_pairs(), state.history.registers());
+        let mut outside = 0;
+        for (register, [low, high]) in layout.observables.iter().zip(ranges) {
+            outside |= registers.get(*register).outside(*low, *high);
+        }
         if outside >> 31 != 0 && state.out_of_range.is_none() {
             let observable = first_outside(layout, state.history.registers(), ranges);
             state.out_of_range = observable.map(|observable| OutOfRange { step, observable });

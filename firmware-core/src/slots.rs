@@ -108,7 +108,7 @@ const BLANK: u32 = u32::MAX;
 const RECORD: usize = PAYLOAD_OFFSET as usize;
 const ERASED: u8 = 0xFF;
 /// Bytes read at a time.
-const BUFFER: usize = 128;
+const BUFFER: usize = 64;
 
 const _: () = assert!(RECORD == HEADER + 4 * 2 * CELL && BUFFER.is_multiple_of(CELL));
 
@@ -125,7 +125,7 @@ pub fn robot(name: &str) -> u32 {
 pub fn sha256(payload: &[u8]) -> [u8; 32] {
     let mut digest = Sha256::new();
     feed(&mut digest, payload);
-    finish(digest)
+    finish(&mut digest)
 }
 
 // Once each: where they are called they would be part of the code.
@@ -136,8 +136,9 @@ fn feed(digest: &mut Sha256, part: &[u8]) {
 }
 
 #[inline(never)]
-fn finish(digest: Sha256) -> [u8; 32] {
-    digest.finalize().into()
+fn finish(digest: &mut Sha256) -> [u8; 32] {
+    // By value it would be copied.
+    digest.finalize_reset().into()
 }
 
 /// Where the slots lie in the flash.
@@ -808,6 +809,7 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`BeginError`]; everything is as it was.
+    #[inline(never)]
     pub fn begin(&mut self, release: &Release) -> Result<(), BeginError> {
         self.check(release)?;
         // That of what runs, even if it cannot be read just now.
@@ -871,6 +873,7 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`WriteError`]; after a failure of the flash the update has to begin again.
+    #[inline(never)]
     pub fn write(&mut self, offset: u32, part: &[u8]) -> Result<(), WriteError<F::Error>> {
         let update = self.update.as_ref().filter(|update| update.stage == Stage::Writing);
         let update = update.ok_or(WriteError::NotWriting)?;
@@ -930,6 +933,7 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`VerifyError`]; unless parts are missing the update has to begin again.
+    #[inline(never)]
     pub fn verify(&mut self) -> Result<Payload, VerifyError<F::Error>> {
         let update = self.update.as_ref().ok_or(VerifyError::NotWriting)?;
         let (written, length) = (update.written, update.header.release.length);
@@ -964,6 +968,7 @@ impl<F: NorFlash> Slots<F> {
     ///
     /// # Errors
     /// [`MarkError`]; the update has to begin again, unless it was [not ready](MarkError::NotReady).
+    #[inline(never)]
     pub fn commit(&mut self) -> Result<(), MarkError<F::Error>> {
         let update = self.update.as_ref().filter(|update| update.stage == Stage::Verified);
         let Update { side, header, .. } = update.ok_or(MarkError::NotReady)?;
@@ -1111,7 +1116,7 @@ fn holds<F: NorFlash>(flash: &mut F, at: u32, release: &Release) -> Result<bool,
         left = left.wrapping_sub(length);
         at = at.wrapping_add(whole as u32);
     }
-    Ok(finish(digest) == release.sha256)
+    Ok(finish(&mut digest) == release.sha256)
 }
 
 /// Bytes beyond the last whole unit.

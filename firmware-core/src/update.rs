@@ -150,7 +150,7 @@
 //! ```
 
 use embedded_storage::nor_flash::NorFlash;
-use heapless::{String, Vec};
+use heapless::{Deque, String, Vec};
 use serde::{Deserialize, Serialize};
 
 use crate::capacity::{
@@ -241,6 +241,19 @@ pub enum Ask {
         /// Of [`Purpose::Abort`].
         signature: Signature,
     },
+}
+
+impl Ask {
+    /// The signature that came with it.
+    fn signature(&self) -> &[u8] {
+        match self {
+            Self::Begin { signature, .. }
+            | Self::Activate { signature, .. }
+            | Self::Confirm { signature }
+            | Self::Abort { signature, .. } => signature,
+            Self::Hello | Self::Chunk { .. } | Self::Verify { .. } => &[],
+        }
+    }
 }
 
 impl Request {
@@ -335,6 +348,32 @@ pub enum Say {
     Aborted,
     /// No, and why.
     Refused(Refused),
+}
+
+/// What was done: a [`Say`] that is not [`Hello`], whose room every call on the way would have to have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Done {
+    Working { most_ms: u32 },
+    Begun { written: u32 },
+    Written { written: u32 },
+    Verified,
+    Activated,
+    Confirmed,
+    Aborted,
+}
+
+impl From<Done> for Say {
+    fn from(done: Done) -> Self {
+        match done {
+            Done::Working { most_ms } => Self::Working { most_ms },
+            Done::Begun { written } => Self::Begun { written },
+            Done::Written { written } => Self::Written { written },
+            Done::Verified => Self::Verified,
+            Done::Activated => Self::Activated,
+            Done::Confirmed => Self::Confirmed,
+            Done::Aborted => Self::Aborted,
+        }
+    }
 }
 
 /// Why the controller does not do it.
@@ -652,15 +691,14 @@ impl Purpose {
 /// ```
 pub fn statement(purpose: Purpose, release: &Release) -> [u8; 64] {
     let Release { length, sha256, sequence, robot } = release;
-    let mut bytes = [0; 64];
-    let mut statement = Writer::new(&mut bytes);
-    statement.array(b"koopman-release\0");
-    statement.array(&[purpose as u8, 0, 0, 0]);
+    let mut statement = [0; 64];
+    let mut writer = Writer::behind(&mut statement, 0);
+    writer.array(b"koopman-release\0").array(&[purpose as u8, 0, 0, 0]);
     for number in [robot, sequence, length] {
-        statement.array(&number.to_le_bytes());
+        writer.array(&number.to_le_bytes());
     }
-    statement.array(sha256);
-    bytes
+    writer.array(sha256);
+    statement
 }
 
 /// Whose releases are installed.
@@ -730,17 +768,51 @@ pub struct Identity<'r> {
     pub good_ticks: u32,
 }
 
+/// Answers that wait to be sent. There is room for two; further ones are dropped, as the host asks again.
+///
+/// They are made where they wait: returned they would be on the stack below whatever finds out what to answer.
+#[derive(Clone, Debug, Default)]
+pub struct Answers(Deque<Answer, 2>);
+
+impl Answers {
+    /// None.
+    pub const fn new() -> Self {
+        Self(Deque::new())
+    }
+
+    /// One more, if there is room.
+    #[inline(never)]
+    pub(crate) fn refuse(&mut self, number: u8, refused: Refused) {
+        let _ = self.0.push_back(Answer { number, say: Say::Refused(refused) });
+    }
+
+    #[inline(never)]
+    fn tell(&mut self, number: u8, done: Done) {
+        let _ = self.0.push_back(Answer { number, say: done.into() });
+    }
+
+    /// The one that has waited longest.
+    pub fn first(&self) -> Option<&Answer> {
+        self.0.front()
+    }
+
+    /// Takes it away.
+    pub fn take(&mut self) -> Option<Answer> {
+        self.0.pop_front()
+    }
+}
+
 /// Takes requests, as a [`Port`](crate::link::Port) hands them on.
 pub trait Updates {
-    /// A request has arrived; what can be answered at once.
-    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer>;
+    /// A request has arrived; answers what can be answered at once.
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64, answers: &mut Answers);
 
     /// Whether there is something to do that takes long: only while the robot is at rest.
     fn is_working(&self) -> bool;
 
     /// Does a part of it: checks a signature, erases a sector, writes a chunk, reads a blob back. Of a
     /// robot that runs nothing is done, and what was asked is given up.
-    fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer>;
+    fn work(&mut self, mode: Mode, now_us: u64, answers: &mut Answers);
 
     /// Whether the robot has to be [held](crate::control_loop::Supervisor::hold) in Safe; to be called
     /// after [`work`](Self::work), with the same time.
@@ -752,18 +824,15 @@ pub trait Updates {
 pub struct NoUpdates;
 
 impl Updates for NoUpdates {
-    fn receive(&mut self, request: Request, _: Mode, _: u64) -> Option<Answer> {
-        let unknown = Refused::Unknown { variant: crate::link::REQUEST };
-        Some(Answer { number: request.number, say: Say::Refused(unknown) })
+    fn receive(&mut self, request: Request, _: Mode, _: u64, answers: &mut Answers) {
+        answers.refuse(request.number, Refused::Unknown { variant: crate::link::REQUEST });
     }
 
     fn is_working(&self) -> bool {
         false
     }
 
-    fn work(&mut self, _: Mode, _: u64) -> Option<Answer> {
-        None
-    }
+    fn work(&mut self, _: Mode, _: u64, _: &mut Answers) {}
 
     fn holds(&mut self, _: u64) -> bool {
         false
@@ -771,10 +840,10 @@ impl Updates for NoUpdates {
 }
 
 impl<U: Updates> Updates for Option<U> {
-    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64, answers: &mut Answers) {
         match self {
-            Some(updates) => updates.receive(request, mode, now_us),
-            None => NoUpdates.receive(request, mode, now_us),
+            Some(updates) => updates.receive(request, mode, now_us, answers),
+            None => NoUpdates.receive(request, mode, now_us, answers),
         }
     }
 
@@ -782,8 +851,10 @@ impl<U: Updates> Updates for Option<U> {
         self.as_ref().is_some_and(Updates::is_working)
     }
 
-    fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer> {
-        self.as_mut()?.work(mode, now_us)
+    fn work(&mut self, mode: Mode, now_us: u64, answers: &mut Answers) {
+        if let Some(updates) = self {
+            updates.work(mode, now_us, answers);
+        }
     }
 
     fn holds(&mut self, now_us: u64) -> bool {
@@ -898,9 +969,10 @@ where
         self.slots.on_trial().then(|| Trial { good: self.good.min(needed), needed })
     }
 
-    fn hello(&self, mode: Mode) -> Hello {
+    #[inline(never)]
+    fn greet(&self, number: u8, mode: Mode, answers: &mut Answers) {
         let Identity { firmware, robot: name, capacities, .. } = &self.identity;
-        Hello {
+        let hello = Hello {
             protocol: PROTOCOL,
             firmware: beginning(firmware),
             name: beginning(name),
@@ -912,7 +984,8 @@ where
             trial: self.trial(),
             floor: self.slots.floor(),
             key: self.trust.key(),
-        }
+        };
+        let _ = answers.0.push_back(Answer { number, say: Say::Hello(hello) });
     }
 
     /// Whether a session is alive; that of an update that is over is not.
@@ -961,7 +1034,8 @@ where
     }
 
     /// What can be said at once; `None` where there is something to do.
-    fn at_once(&mut self, ask: &Ask, now_us: u64) -> Result<Option<Say>, Refused> {
+    #[inline(never)]
+    fn at_once(&mut self, ask: &Ask, now_us: u64) -> Result<Option<Done>, Refused> {
         if self.resets && !matches!(ask, Ask::Activate { .. }) {
             return Err(Refused::Working);
         }
@@ -983,7 +1057,7 @@ where
                     Some(_) if same => {
                         if let Some(written) = self.slots.written() {
                             self.of_session(*id, now_us)?;
-                            return Ok(Some(Say::Begun { written }));
+                            return Ok(Some(Done::Begun { written }));
                         }
                     }
                     _ => {}
@@ -1006,12 +1080,12 @@ where
                     return Err(Refused::OutOfOrder { written });
                 }
                 if bytes.is_empty() {
-                    return Ok(Some(Say::Written { written }));
+                    return Ok(Some(Done::Written { written }));
                 }
             }
             Ask::Activate { signature, .. } => {
                 if self.resets {
-                    return Ok(Some(Say::Activated));
+                    return Ok(Some(Done::Activated));
                 }
                 self.signed(signature, now_us)?;
             }
@@ -1024,13 +1098,12 @@ where
         Ok(None)
     }
 
-    /// Looks at a signature.
-    fn check(
-        &mut self,
-        purpose: Purpose,
-        release: &Release,
-        signature: &Signature,
-    ) -> Result<(), Refused> {
+    /// Looks at a signature of what is installed, or runs.
+    fn check(&mut self, purpose: Purpose, release: &Release) -> Result<(), Refused> {
+        let signature = match &self.job {
+            Some(Job::Ask(Request { ask, .. })) => ask.signature(),
+            _ => &[],
+        };
         // Nothing has to be said where everybody is trusted.
         if self.trust.key().is_none() || self.trust.accepts(&statement(purpose, release), signature)
         {
@@ -1041,30 +1114,44 @@ where
         Err(Refused::Signature)
     }
 
+    /// The same of the update under way.
+    #[inline(never)]
+    fn check_update(&mut self, purpose: Purpose, missing: Refused) -> Result<(), Refused> {
+        let release = self.slots.update().ok_or(missing)?;
+        self.check(purpose, &release)
+    }
+
+    /// Begins an update, or goes on with it.
+    #[inline(never)]
+    fn begin(&mut self, number: u8, id: u32, release: Release) -> Result<Done, Refused> {
+        self.check(Purpose::Install, &release)?;
+        self.session = Some(Session { id, heard_us: None });
+        if self.slots.is_of(&release) && !self.slots.is_committed() {
+            if let Some(written) = self.slots.written() {
+                return Ok(Done::Begun { written });
+            }
+        } else if self.slots.begin(&release).is_err() {
+            // Checked when it arrived.
+            return Err(Refused::NoSession);
+        }
+        self.job = Some(Job::Erase(number));
+        Ok(self.working())
+    }
+
     /// Drops the update.
     fn drop_update(&mut self) -> Result<(), Refused> {
         self.session = None;
         self.slots.abort().map_err(|_| Refused::Flash)
     }
 
-    /// Does what takes long.
-    fn perform(&mut self, number: u8, ask: &Ask) -> Result<Say, Refused> {
+    /// Does what was asked and takes long. The request stays where it is.
+    fn perform(&mut self) -> Result<Done, Refused> {
+        let Some(Job::Ask(Request { number, ask })) = &self.job else {
+            return Err(Refused::NoSession);
+        };
         match ask {
             Ask::Hello => Err(Refused::Unknown { variant: crate::link::REQUEST }),
-            Ask::Begin { session: id, release, signature } => {
-                self.check(Purpose::Install, release, signature)?;
-                self.session = Some(Session { id: *id, heard_us: None });
-                if self.slots.is_of(release) && !self.slots.is_committed() {
-                    if let Some(written) = self.slots.written() {
-                        return Ok(Say::Begun { written });
-                    }
-                } else if self.slots.begin(release).is_err() {
-                    // Checked when it arrived.
-                    return Err(Refused::NoSession);
-                }
-                self.job = Some(Job::Erase(number));
-                Ok(self.working())
-            }
+            Ask::Begin { session, release, .. } => self.begin(*number, *session, *release),
             Ask::Chunk { offset, bytes, .. } => {
                 self.slots.write(*offset, bytes).map_err(|error| match error {
                     WriteError::OutOfOrder { expected: written, .. } => {
@@ -1073,7 +1160,7 @@ where
                     WriteError::Flash(_) => Refused::Flash,
                     _ => Refused::NoSession,
                 })?;
-                Ok(Say::Written { written: self.slots.written().unwrap_or(0) })
+                Ok(Done::Written { written: self.slots.written().unwrap_or(0) })
             }
             Ask::Verify { .. } => {
                 let payload = match self.slots.verify() {
@@ -1092,49 +1179,47 @@ where
                     self.drop_update()?;
                     return Err(Refused::Model);
                 }
-                Ok(Say::Verified)
+                Ok(Done::Verified)
             }
-            Ask::Activate { signature, .. } => {
-                let release = self.slots.update().ok_or(Refused::NotVerified)?;
-                self.check(Purpose::Activate, &release, signature)?;
+            Ask::Activate { .. } => {
+                self.check_update(Purpose::Activate, Refused::NotVerified)?;
                 self.slots.commit().map_err(|error| match error {
                     MarkError::NotReady => Refused::NotVerified,
                     _ => Refused::Flash,
                 })?;
                 self.resets = true;
-                Ok(Say::Activated)
+                Ok(Done::Activated)
             }
-            Ask::Confirm { signature } => {
+            Ask::Confirm { .. } => {
                 // Ticks may have come since.
                 self.may_confirm()?;
                 let release = self.release;
-                self.check(Purpose::Confirm, &release, signature)?;
+                self.check(Purpose::Confirm, &release)?;
                 self.slots.confirm().map_err(|error| match error {
                     MarkError::NotReady => Refused::NotOnTrial,
                     _ => Refused::Flash,
                 })?;
-                Ok(Say::Confirmed)
+                Ok(Done::Confirmed)
             }
-            Ask::Abort { signature, .. } => {
-                let release = self.slots.update().ok_or(Refused::NoSession)?;
-                self.check(Purpose::Abort, &release, signature)?;
+            Ask::Abort { .. } => {
+                self.check_update(Purpose::Abort, Refused::NoSession)?;
                 self.drop_update()?;
-                Ok(Say::Aborted)
+                Ok(Done::Aborted)
             }
         }
     }
 
     /// What is said while the slot is erased.
-    fn working(&self) -> Say {
+    fn working(&self) -> Done {
         // One sector more for what else there is to do.
         let sectors = self.slots.sectors().saturating_add(1);
-        Say::Working { most_ms: sectors.saturating_mul(self.identity.erase_ms) }
+        Done::Working { most_ms: sectors.saturating_mul(self.identity.erase_ms) }
     }
 
     /// Erases a sector; `None` until it was the last.
-    fn erase(&mut self) -> Option<Result<Say, Refused>> {
+    fn erase(&mut self) -> Option<Result<Done, Refused>> {
         match self.slots.erase() {
-            Ok(0) => Some(Ok(Say::Begun { written: 0 })),
+            Ok(0) => Some(Ok(Done::Begun { written: 0 })),
             Ok(_) => None,
             Err(_) => Some(Err(Refused::Flash)),
         }
@@ -1148,31 +1233,29 @@ where
     A: FnMut(Payload) -> bool,
 {
     #[inline(never)]
-    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64, answers: &mut Answers) {
         self.settle(now_us);
         let Request { number, ask } = &request;
         let number = *number;
-        let answer = |say| Some(Answer { number, say });
         if matches!(ask, Ask::Hello) {
-            return answer(Say::Hello(self.hello(mode)));
+            return self.greet(number, mode, answers);
         }
         if mode == Mode::Running {
-            return answer(Say::Refused(Refused::Busy));
+            return answers.refuse(number, Refused::Busy);
         }
         match &self.job {
             // It is on its way.
-            Some(Job::Ask(Request { number: known, .. })) if *known == number => return None,
-            Some(Job::Erase(known)) if *known == number => return answer(self.working()),
-            Some(_) => return answer(Say::Refused(Refused::Working)),
+            Some(Job::Ask(Request { number: known, .. })) if *known == number => return,
+            Some(Job::Erase(known)) if *known == number => {
+                return answers.tell(number, self.working());
+            }
+            Some(_) => return answers.refuse(number, Refused::Working),
             None => {}
         }
         match self.at_once(ask, now_us) {
-            Ok(Some(say)) => answer(say),
-            Ok(None) => {
-                self.job = Some(Job::Ask(request));
-                None
-            }
-            Err(refused) => answer(Say::Refused(refused)),
+            Ok(Some(done)) => answers.tell(number, done),
+            Ok(None) => self.job = Some(Job::Ask(request)),
+            Err(refused) => answers.refuse(number, refused),
         }
     }
 
@@ -1181,27 +1264,26 @@ where
     }
 
     #[inline(never)]
-    fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn work(&mut self, mode: Mode, now_us: u64, answers: &mut Answers) {
         self.settle(now_us);
-        let (number, result) = match self.job.take()? {
+        let (number, result) = match &self.job {
+            None => return,
             // It was started in the meantime.
-            Job::Ask(Request { number, .. }) if mode == Mode::Running => {
-                (number, Err(Refused::Busy))
+            Some(Job::Ask(Request { number, .. })) if mode == Mode::Running => {
+                (*number, Err(Refused::Busy))
             }
-            Job::Ask(Request { number, ask }) => (number, self.perform(number, &ask)),
+            Some(Job::Ask(Request { number, .. })) => (*number, self.perform()),
             // Whoever calls this has not held the robot yet.
-            job @ Job::Erase(_) if mode != Mode::Safe => {
-                self.job = Some(job);
-                return None;
+            Some(Job::Erase(_)) if mode != Mode::Safe => return,
+            Some(Job::Erase(number)) => {
+                let number = *number;
+                let Some(result) = self.erase() else { return };
+                (number, result)
             }
-            Job::Erase(number) => match self.erase() {
-                Some(result) => (number, result),
-                None => {
-                    self.job = Some(Job::Erase(number));
-                    return None;
-                }
-            },
         };
+        if !matches!(result, Ok(Done::Working { .. })) {
+            self.job = None;
+        }
         if matches!(result, Err(Refused::Flash)) {
             self.session = None;
         }
@@ -1210,7 +1292,10 @@ where
             session.heard_us = None;
         }
         self.worked = true;
-        Some(Answer { number, say: result.unwrap_or_else(Say::Refused) })
+        match result {
+            Ok(done) => answers.tell(number, done),
+            Err(refused) => answers.refuse(number, refused),
+        }
     }
 
     fn holds(&mut self, now_us: u64) -> bool {

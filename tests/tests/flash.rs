@@ -19,7 +19,7 @@ use firmware_core::link::Port;
 use firmware_core::model::Model;
 use firmware_core::slots::{Geometry, Payload, Release, Which, sha256};
 use firmware_core::update::{
-    Answer, Ask, Capacities, Identity, PublicKey, Purpose, Refused, Request, Updater, Updates,
+    Answers, Ask, Capacities, Identity, PublicKey, Purpose, Refused, Request, Updater, Updates,
     statement,
 };
 use firmware_sim::mcu::flash::Region;
@@ -237,29 +237,28 @@ struct Watched {
 }
 
 impl Updates for Watched {
-    fn receive(&mut self, request: Request, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn receive(&mut self, request: Request, mode: Mode, now_us: u64, answers: &mut Answers) {
         if let Ask::Chunk { offset, bytes, .. } = &request.ask {
             self.chunks.borrow_mut().push((*offset, bytes.len()));
         }
         let signed =
             matches!(request.ask, Ask::Begin { .. } | Ask::Activate { .. } | Ask::Confirm { .. });
         let worked = self.updater.is_working();
-        let answer = self.updater.receive(request, mode, now_us);
+        self.updater.receive(request, mode, now_us, answers);
         if !worked && self.updater.is_working() {
             self.checks = signed;
         }
-        answer
     }
 
     fn is_working(&self) -> bool {
         self.updater.is_working()
     }
 
-    fn work(&mut self, mode: Mode, now_us: u64) -> Option<Answer> {
+    fn work(&mut self, mode: Mode, now_us: u64, answers: &mut Answers) {
         if std::mem::take(&mut self.checks) {
             self.clock.advance_ns(SIGNATURE_NS);
         }
-        self.updater.work(mode, now_us)
+        self.updater.work(mode, now_us, answers);
     }
 
     fn holds(&mut self, now_us: u64) -> bool {

@@ -20,9 +20,9 @@ use firmware_core::slots::{
     Which, robot, sha256,
 };
 use firmware_core::update::{
-    Answer, Ask, Capacities, Hello, Identity, MAX_CHUNK, NoUpdates, PROTOCOL, PublicKey, Purpose,
-    Refused, Request, SIGNATURE, SIGNATURE_PAUSE_US, SILENCE_US, Say, Signature, Trial, Trust,
-    Updater, Updates, statement,
+    Answer, Answers, Ask, Capacities, Hello, Identity, MAX_CHUNK, NoUpdates, PROTOCOL, PublicKey,
+    Purpose, Refused, Request, SIGNATURE, SIGNATURE_PAUSE_US, SILENCE_US, Say, Signature, Trial,
+    Trust, Updater, Updates, statement,
 };
 use firmware_sim::mcu::uart::UartSettings;
 use serde_json::{Map, Value};
@@ -978,16 +978,20 @@ impl<'m> Controller<'m> {
 
     fn receive(&mut self, number: u8, ask: &Ask) -> Option<Say> {
         let request = Request { number, ask: ask.clone() };
-        let answer = self.updater.receive(request, self.mode, self.now_us)?;
+        let mut answers = Answers::new();
+        self.updater.receive(request, self.mode, self.now_us, &mut answers);
+        let answer = answers.take()?;
         assert_eq!(answer.number, number);
         Some(answer.say)
     }
 
     /// Until there is an answer.
     fn work(&mut self) -> Say {
+        let mut answers = Answers::new();
         for _ in 0..100 {
             assert!(self.updater.is_working());
-            if let Some(answer) = self.updater.work(self.mode, self.now_us) {
+            self.updater.work(self.mode, self.now_us, &mut answers);
+            if let Some(answer) = answers.take() {
                 return answer.say;
             }
         }
@@ -1092,9 +1096,10 @@ fn requests_are_answered_in_the_modes_specified() {
             assert_eq!(busy, mode == Mode::Running && row[2] == "Busy", "{ask:?}, {mode:?}");
         }
         let request = Request { number: 7, ask: ask.clone() };
-        let answer = NoUpdates.receive(request, Mode::Idle, 0);
+        let mut answers = Answers::new();
+        NoUpdates.receive(request, Mode::Idle, 0, &mut answers);
         let say = Say::Refused(Refused::Unknown { variant: 5 });
-        assert_eq!(answer, Some(Answer { number: 7, say }));
+        assert_eq!(answers.take(), Some(Answer { number: 7, say }));
     }
     page.holds("A controller that takes no updates answers every request, `Hello` too, with `Refused(Unknown)`");
     assert!(page.wrong.is_empty(), "\n{}", page.wrong.join("\n"));

@@ -94,6 +94,8 @@ impl<const M: usize> Rhythm<M> {
 
     /// The tick ends: the last sample's frame is sent, once it is complete. What is noticed after the sample's tick
     /// is left to the frame after that.
+    // A frame of its own on the stack: that of the tick lies beneath the model's steps.
+    #[inline(never)]
     pub fn end<const N: usize, const H: usize>(
         &mut self,
         tracker: &Tracker<'_, '_, N, M, H>,

@@ -712,11 +712,11 @@ impl Sealed for f32 {
         outputs: &mut [f32],
     ) {
         let kernel = match outputs.len() {
+            0 => return,
             1 => terms_1,
             2 => terms_2,
             3 => terms_3,
-            4 => terms_4,
-            _ => return,
+            _ => terms_4,
         };
         let count = products.len();
         let row = count.wrapping_add(1);

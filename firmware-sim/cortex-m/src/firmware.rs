@@ -13,7 +13,7 @@ use embedded_storage::nor_flash::{
 use firmware_core::blob::{Aligned, parse_into};
 use firmware_core::control_loop::rosbot::{Motor, RosbotSettings, Sides};
 use firmware_core::control_loop::soft_leg::{Chamber, Pneumatics, SoftLegSettings};
-use firmware_core::control_loop::telemetry::Queue;
+use firmware_core::control_loop::telemetry::{Frames, Queue};
 use firmware_core::control_loop::{ControlLoop, Rosbot, SoftLeg, Telemetry};
 use firmware_core::device::{EncoderCount, PositionSensor};
 use firmware_core::link::Port;
@@ -23,6 +23,10 @@ use firmware_core::{Model, PredictorState};
 
 static ROSBOT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/skid-rosbot/model.bin"));
 static LEG: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../models/soft-leg/model.bin"));
+
+/// Places in the queue of telemetry, of which one is always free: a frame waits there while another message is on
+/// the line, which is over long before the next sample.
+const FRAMES: usize = 2;
 
 /// Every device: what it reads nobody knows, what it writes goes nowhere.
 struct Nowhere;
@@ -183,6 +187,7 @@ fn load(model: &mut Model<'static>, robot: &str, blob: &'static [u8]) -> Option<
 }
 
 /// Its loop.
+#[inline(never)]
 pub fn rosbot_loop<'m, 'q>(
     model: &'m Model<'static>,
     telemetry: Telemetry<'q>,
@@ -201,6 +206,7 @@ pub fn leg_model(model: &mut Model<'static>) -> Option<()> {
 }
 
 /// Its loop.
+#[inline(never)]
 pub fn leg_loop<'m, 'q>(
     model: &'m Model<'static>,
     telemetry: Telemetry<'q>,
@@ -216,6 +222,9 @@ pub fn leg_loop<'m, 'q>(
     SoftLeg::<_, _, 20>::new(model, pneumatics, tip, settings, telemetry).ok()
 }
 
+/// What installs models.
+type Updates<T> = Updater<'static, Nowhere, T, fn(Payload) -> bool>;
+
 /// The ROSbot as long as it `goes_on`, asked at every tick.
 #[inline(never)]
 pub fn rosbot<S: Read + ReadReady + Write + WriteReady>(
@@ -223,14 +232,12 @@ pub fn rosbot<S: Read + ReadReady + Write + WriteReady>(
     serial: S,
     goes_on: impl FnMut() -> bool,
 ) -> Option<()> {
-    let mut model = no_model();
-    rosbot_model(&mut model)?;
-    let mut queue = Queue::<4>::new();
-    let (producer, mut frames) = queue.split();
-    let mut robot = rosbot_loop(&model, Telemetry::new(producer))?;
     static IDENTITY: Identity<'static> =
         identity("skid-rosbot", &ROSBOT.0, Capacities::new::<3, 2>(100_000, 0));
-    serve(&mut robot, trust, &IDENTITY, &mut frames, serial, goes_on)
+    let mut updater = boot(&IDENTITY, trust);
+    let mut model = no_model();
+    rosbot_model(&mut model)?;
+    run_rosbot(&model, updater.as_mut()?, serial, goes_on)
 }
 
 /// The leg.
@@ -240,33 +247,63 @@ pub fn leg<S: Read + ReadReady + Write + WriteReady>(
     serial: S,
     goes_on: impl FnMut() -> bool,
 ) -> Option<()> {
-    let mut model = no_model();
-    leg_model(&mut model)?;
-    let mut queue = Queue::<4>::new();
-    let (producer, mut frames) = queue.split();
-    let mut leg = leg_loop(&model, Telemetry::new(producer))?;
     static IDENTITY: Identity<'static> =
         identity("soft-leg", &LEG.0, Capacities::new::<2, 2>(50_000, 0));
-    serve(&mut leg, trust, &IDENTITY, &mut frames, serial, goes_on)
+    let mut updater = boot(&IDENTITY, trust);
+    let mut model = no_model();
+    leg_model(&mut model)?;
+    run_leg(&model, updater.as_mut()?, serial, goes_on)
+}
+
+// What comes once is off the stack when the loop runs: what decides which model that is, what loads it, and what
+// the loop is made from. And nothing is unwrapped, which would be a copy.
+
+#[inline(never)]
+fn boot<T: Trust>(identity: &Identity<'static>, trust: T) -> Option<Updates<T>> {
+    let geometry = Geometry { offset: 0, slot_bytes: 128 * 1024 };
+    let accept = |payload: Payload| black_box(payload.length) > 0;
+    let booted = Updater::boot(Nowhere, geometry, *identity, 0, trust, accept as fn(_) -> _);
+    booted.ok().map(|(updater, _)| updater)
+}
+
+#[inline(never)]
+fn run_rosbot(
+    model: &Model<'static>,
+    updater: &mut Updates<impl Trust>,
+    serial: impl Read + ReadReady + Write + WriteReady,
+    goes_on: impl FnMut() -> bool,
+) -> Option<()> {
+    let mut queue = Queue::<FRAMES>::new();
+    let (producer, mut frames) = queue.split();
+    let mut robot = rosbot_loop(model, Telemetry::new(producer));
+    serve(robot.as_mut()?, updater, &mut frames, serial, goes_on)
+}
+
+#[inline(never)]
+fn run_leg(
+    model: &Model<'static>,
+    updater: &mut Updates<impl Trust>,
+    serial: impl Read + ReadReady + Write + WriteReady,
+    goes_on: impl FnMut() -> bool,
+) -> Option<()> {
+    let mut queue = Queue::<FRAMES>::new();
+    let (producer, mut frames) = queue.split();
+    let mut leg = leg_loop(model, Telemetry::new(producer));
+    serve(leg.as_mut()?, updater, &mut frames, serial, goes_on)
 }
 
 #[inline(never)]
 fn serve(
     robot: &mut dyn ControlLoop<2>,
-    trust: impl Trust,
-    identity: &Identity<'static>,
-    frames: &mut firmware_core::control_loop::telemetry::Frames<'_>,
+    updater: &mut Updates<impl Trust>,
+    frames: &mut Frames<'_>,
     mut serial: impl Read + ReadReady + Write + WriteReady,
     mut goes_on: impl FnMut() -> bool,
 ) -> Option<()> {
-    let geometry = Geometry { offset: 0, slot_bytes: 128 * 1024 };
-    let accept = |payload: Payload| black_box(payload.length) > 0;
-    let booted = Updater::boot(Nowhere, geometry, *identity, 0, trust, accept);
-    let (mut updater, _) = booted.ok()?;
     let mut port = Port::new();
     while goes_on() && !(updater.resets() && port.is_sent()) {
         let now_us = black_box(0);
-        port.receive(&mut serial, robot, &mut updater, now_us);
+        port.receive(&mut serial, robot, updater, now_us);
         robot.tick(now_us);
         robot.finish(black_box(0));
         updater.ticked(robot.alarms());
