@@ -20,9 +20,8 @@
 //! | `brown-out` | the microcontroller's supply dips | | share that is lost |
 //!
 //! Without a unit, all units are hit. A fault of the plant counts once per unit and tick, a stuck valve once
-//! per draw. Sensors, encoders and the host's line are wrapped
-//! ([`faulty`](crate::faulty)); the plant's faults act through the `apply` of a
-//! [`bench`](mod@crate::bench); ticks and the microcontroller's supply are the business of whoever
+//! per draw. Sensors, encoders and the host's line are wrapped ([`faulty`](crate::faulty)); the plant's faults
+//! act through the `apply` of a [`bench`](mod@crate::bench); ticks and the microcontroller's supply are the business of whoever
 //! runs the loop, who asks [`Faults::late_by_us`] and [`Faults::act`].
 
 use crate::log::stream;

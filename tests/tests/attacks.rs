@@ -50,7 +50,8 @@ fn sign(pair: &KeyPair, purpose: Purpose, release: &Release) -> Signature {
 }
 
 fn release(blob: &Blob, sequence: u32) -> Release {
-    Release::new("skid-rosbot", sequence, blob.bytes()).unwrap()
+    let model = blob.model().unwrap();
+    Release::new(model.structure().robot(), sequence, blob.bytes()).unwrap()
 }
 
 /// What a host does, one after the other.
@@ -176,7 +177,12 @@ fn scenario(seconds: f64) -> Scenario {
 
 /// Goes through the steps on a ROSbot at rest; what was said, and what the run showed.
 fn go(store: &mut Store, seconds: f64, steps: &[Step]) -> (Heard, Summary) {
-    let factory = blob("skid-rosbot");
+    go_on("skid-rosbot", store, seconds, steps)
+}
+
+/// The same on another robot.
+fn go_on(robot: &str, store: &mut Store, seconds: f64, steps: &[Step]) -> (Heard, Summary) {
+    let factory = blob(robot);
     let scenario = scenario(seconds);
     let heard = Rc::new(RefCell::new(Heard::default()));
     let laptop = |end| Hand {
@@ -231,7 +237,11 @@ fn refused(answers: &[Option<Say>]) -> Vec<Refused> {
 
 /// A blob that differs from the factory's, so that it is seen which one runs.
 fn other_model() -> Blob {
-    let mut bytes = blob("skid-rosbot").bytes().to_vec();
+    other_model_of("skid-rosbot")
+}
+
+fn other_model_of(robot: &str) -> Blob {
+    let mut bytes = blob(robot).bytes().to_vec();
     // A tolerance of the self-test: that section ends where its table says.
     let entry = bytes[16..].chunks(12).find(|entry| entry[..2] == [3, 0]).unwrap();
     let number = |at: usize| u32::from_le_bytes(entry[at..at + 4].try_into().unwrap()) as usize;
@@ -252,13 +262,17 @@ fn crc32(bytes: &[u8]) -> u32 {
 
 /// The owner installs a model, which is confirmed after its trial.
 fn installed(sequence: u32) -> Store {
-    let mut store = Store::new(&blob("skid-rosbot"), Some(key()));
-    let new = other_model();
+    installed_on("skid-rosbot", sequence)
+}
+
+fn installed_on(robot: &str, sequence: u32) -> Store {
+    let mut store = Store::new(&blob(robot), Some(key()));
+    let new = other_model_of(robot);
     let confirm = sign(&owner(), Purpose::Confirm, &release(&new, sequence));
     let mut steps = ask(&update(&new, sequence));
     steps.push(Step::Wait(12_000_000));
     steps.push(Step::Ask(Ask::Confirm { signature: confirm }));
-    let (heard, summary) = go(&mut store, 20.0, &steps);
+    let (heard, summary) = go_on(robot, &mut store, 20.0, &steps);
     assert_eq!(heard.answers.last(), Some(&Some(Say::Confirmed)), "{:?}", heard.answers);
     assert_eq!(summary.driven_at_rest, 0);
     let boots: Vec<_> = store.boots.iter().map(|b| (b.running, b.sequence, b.trial)).collect();
@@ -407,6 +421,31 @@ fn whoever_has_no_signed_release_is_refused_at_rest() {
     // The loop misses no deadline while signatures are checked: a tick or two are left out.
     assert_eq!((summary.deadline_misses, summary.driven_at_rest, summary.resets), (0, 0, 0));
     assert_eq!(store.signatures - 3, 5, "one per second at most");
+}
+
+/// A signature takes longer than several of its ticks.
+#[test]
+fn a_leg_leaves_ticks_out_for_updates_and_is_not_late() {
+    let mut store = installed_on("soft-leg", 5);
+    let (image, signatures) = (store.image.clone(), store.signatures);
+    let forged = sign(&pair(2), Purpose::Install, &release(&blob("soft-leg"), 6));
+    let forged = begin(1, release(&blob("soft-leg"), 6), forged);
+    let wait = Step::Wait(1_100_000);
+    let steps = [wait.clone(), Step::Ask(forged.clone()), wait.clone(), Step::Ask(forged), wait];
+    let (heard, summary) = go_on("soft-leg", &mut store, 5.0, &steps);
+    let answers: Vec<_> = heard.answers.into_iter().flatten().map(Some).collect();
+    assert_eq!(refused(&answers), [Refused::Signature; 2]);
+    assert_eq!(store.signatures - signatures, 2);
+    assert!(store.image == image);
+    assert!(heard.frames.len() > 90);
+    for frame in &heard.frames {
+        assert_eq!((frame.mode, frame.alarms), (Mode::Idle, Alarms::none()));
+        assert_eq!(frame.noticed, Alarms::none());
+    }
+    assert_eq!((summary.deadline_misses, summary.driven_at_rest, summary.resets), (0, 0, 0));
+    // Some at boot, and for each of the two signatures.
+    let left_out = 2_500 - summary.ticks;
+    assert!((12..60).contains(&left_out), "{left_out}");
 }
 
 #[test]

@@ -480,6 +480,20 @@ mod tests {
     }
 
     #[test]
+    fn a_leg_bends_as_on_its_bench() {
+        let mut plant = Plant::new(Robot::SoftLeg, &[], 1).unwrap();
+        // Line of the bending chamber and input pump; half of the supply for a second.
+        let (robot, duties, pins) = (Robot::SoftLeg, [2333, 0], 1 | 1 << 2);
+        let bends = (0..100).map(|tick| plant.tick(&Actuators { robot, tick, duties, pins }));
+        let measured = bends.last().unwrap().unwrap().position.unwrap().0;
+        // Measured with 0.1 mm of noise.
+        assert!(
+            (measured[0] - 24.82).abs() < 0.5 && (measured[1] - 6.82).abs() < 0.5,
+            "{measured:?}"
+        );
+    }
+
+    #[test]
     fn pins_turn_motors_round_without_load() {
         let mut plant = plant(&[]).unwrap();
         ticks(&mut plant, 0..100);

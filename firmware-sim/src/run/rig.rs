@@ -40,7 +40,7 @@ pub(crate) trait Rig<const N: usize> {
     fn advance_us(&mut self, us: u64);
     fn board(&mut self) -> &mut Board;
     fn clock(&self) -> VirtualClock;
-    /// The true coordinates, which the position sensor has only now, too.
+    /// The true coordinates. To be asked before a measurement: the position sensor sees them from now on.
     fn truth(&mut self) -> [f64; N];
     /// Whether nothing is driven.
     fn is_off(&self) -> bool;
