@@ -12,7 +12,7 @@
 
 use crate::control_loop::ControlLoopError;
 use crate::control_loop::supervisor::{Report, Supervisor};
-use crate::control_loop::telemetry::{Frame, Telemetry};
+use crate::control_loop::telemetry::Telemetry;
 use crate::control_loop::tracker::Tracker;
 
 /// What a loop with `M` inputs and several ticks per sample keeps of them.
@@ -94,8 +94,6 @@ impl<const M: usize> Rhythm<M> {
 
     /// The tick ends: the last sample's frame is sent, once it is complete. What is noticed after the sample's tick
     /// is left to the frame after that.
-    // A frame of its own on the stack: that of the tick lies beneath the model's steps.
-    #[inline(never)]
     pub fn end<const N: usize, const H: usize>(
         &mut self,
         tracker: &Tracker<'_, '_, N, M, H>,
@@ -109,7 +107,7 @@ impl<const M: usize> Rhythm<M> {
         if self.is_done
             && let Some(report) = self.report.take()
         {
-            telemetry.send(Frame::of(self.time_us, report, tracker));
+            telemetry.tell(self.time_us, report, &tracker.told());
         }
     }
 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::capacity::{MAX_INPUTS, MAX_STATES};
 use crate::control_loop::supervisor::{Alarms, Mode, Report};
-use crate::control_loop::tracker::Tracker;
+use crate::control_loop::tracker::{Told, Tracker};
 use crate::encoding::Writer;
 
 /// One sample.
@@ -109,6 +109,13 @@ impl<'q> Telemetry<'q> {
         }
     }
 
+    /// Sends the frame of a sample.
+    // On a stack of its own: that of a tick lies beneath the model's steps.
+    #[inline(never)]
+    pub(crate) fn tell(&mut self, time_us: u64, report: Report, told: &Told<'_>) {
+        self.send(Frame::told(time_us, report, told));
+    }
+
     /// Frames dropped so far.
     pub fn dropped(&self) -> u32 {
         self.dropped
@@ -122,26 +129,27 @@ impl Frame {
         report: Report,
         tracker: &Tracker<'_, '_, N, M, H>,
     ) -> Self {
-        let tracked = tracker.tracked();
-        let optional = |x| Option::as_ref(x).map_or(&[][..], <[f32; N]>::as_slice);
-        let mut frame = Self {
+        Self::told(time_us, report, &tracker.told())
+    }
+
+    /// [`of`](Self::of): a controller has this once, whatever loops it runs.
+    #[inline(never)]
+    pub(crate) fn told(time_us: u64, report: Report, told: &Told<'_>) -> Self {
+        Self {
             time_us,
             mode: report.mode,
             alarms: report.alarms,
             noticed: report.noticed,
             worst_tick_us: report.worst_tick_us,
-            steps: tracked.steps,
-            bound_steps: tracked.bound_steps,
+            applied: list(told.applied),
+            measured: list(told.measured),
+            predicted: list(told.predicted),
+            residual: list(told.residual),
+            ahead: list(told.ahead),
+            steps: told.steps,
+            bound_steps: told.bound_steps,
             ..Self::default()
-        };
-        frame.list(
-            tracker.applied(),
-            optional(&tracked.measured),
-            optional(&tracked.predicted),
-            optional(&tracked.residual),
-            tracker.path().last().map_or(&[], |x| x.as_slice()),
-        );
-        frame
+        }
     }
 
     /// As postcard writes it.
@@ -152,23 +160,6 @@ impl Frame {
         let to = to.numbers(&self.predicted).numbers(&self.residual);
         let to = to.word(self.steps).word(self.bound_steps).numbers(&self.ahead);
         to.word(self.worst_tick_us).word(self.dropped);
-    }
-
-    /// Takes the lists: a controller has this once, whatever loops it runs.
-    #[inline(never)]
-    fn list(
-        &mut self,
-        applied: &[f32],
-        measured: &[f32],
-        predicted: &[f32],
-        residual: &[f32],
-        ahead: &[f32],
-    ) {
-        self.applied = list(applied);
-        self.measured = list(measured);
-        self.predicted = list(predicted);
-        self.residual = list(residual);
-        self.ahead = list(ahead);
     }
 }
 

@@ -165,6 +165,22 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         }
     }
 
+    /// What a frame says of it.
+    #[inline(always)]
+    pub(crate) fn told(&self) -> Told<'_> {
+        let Seen { predicted, used, compared, steps, bound_steps, .. } = self.seen;
+        let none: &[f32] = &[];
+        Told {
+            applied: &self.applied,
+            measured: if used { &self.measured } else { none },
+            predicted: if predicted { &self.predicted } else { none },
+            residual: if compared { &self.residual } else { none },
+            ahead: self.path().last().map_or(none, <[f32; N]>::as_slice),
+            steps,
+            bound_steps,
+        }
+    }
+
     /// The mean inputs that acted before it.
     pub fn applied(&self) -> &[f32; M] {
         &self.applied
@@ -232,6 +248,17 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
     pub fn forget_residuals(&mut self) {
         self.beside.forget_residuals();
     }
+}
+
+/// What a frame says of a sample: lists of [`Frame`](crate::control_loop::Frame), empty where there is nothing.
+pub(crate) struct Told<'t> {
+    pub(crate) applied: &'t [f32],
+    pub(crate) measured: &'t [f32],
+    pub(crate) predicted: &'t [f32],
+    pub(crate) residual: &'t [f32],
+    pub(crate) ahead: &'t [f32],
+    pub(crate) steps: u32,
+    pub(crate) bound_steps: u32,
 }
 
 /// A [`Measurement`] whose coordinates are elsewhere.
