@@ -178,9 +178,9 @@ impl Program {
     }
 
     pub(crate) fn clear(&mut self) {
+        self.entries.iter_mut().take(self.end.into()).for_each(|entry| *entry = [0; 2]);
         (self.first, self.first_term, self.end) = (0, 0, 0);
         (self.harmonics, self.powers, self.terms, self.count) = (0, 0, 0, 0);
-        self.entries.fill([0; 2]);
         self.direct.clear();
     }
 
@@ -197,7 +197,7 @@ impl Program {
     }
 
     /// Puts an entry behind the others, if there is room.
-    #[inline(never)]
+    #[inline(always)]
     fn put(&mut self, entry: [u8; 2]) {
         let place = self.entries.get_mut(usize::from(self.end));
         place.into_iter().for_each(|place| *place = entry);

@@ -726,7 +726,8 @@ impl<'a, S: Scalar> Model<'a, S> {
             }
             let (pairs, _) = ranges.as_chunks::<2>();
             // Of what is not a number nothing is true.
-            if let Some(index) = pairs.iter().position(|[low, high]| !matches!(low <= high, true)) {
+            let is_range = |[low, high]: &[S; 2]| low <= high;
+            if let Some(index) = pairs.iter().position(|pair| !is_range(pair)) {
                 let field = "trained range of an observable";
                 return Err(ModelError::Number { field, index }.into());
             }

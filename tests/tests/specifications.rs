@@ -1152,7 +1152,9 @@ fn a_session_goes_on_anew_or_ends_with_what_is_signed_for_that() {
     // Whoever has not held the robot yet does not get it erased.
     controller.mode = Mode::Idle;
     for _ in 0..3 {
-        assert_eq!(controller.updater.work(controller.mode, controller.now_us), None);
+        let mut answers = Answers::new();
+        controller.updater.work(controller.mode, controller.now_us, &mut answers);
+        assert_eq!(answers.take(), None);
         assert!(controller.updater.is_working());
     }
     controller.mode = Mode::Safe;

@@ -9,9 +9,9 @@ use crate::error::koopman_error_t::{self, *};
 use crate::pointer::{Marked, array_mut, bytes, check, overlap, put, room};
 
 /// Pointers and sizes in a koopman_model_t.
-pub const KOOPMAN_MODEL_POINTERS: usize = 96;
+pub const KOOPMAN_MODEL_POINTERS: usize = 93;
 /// Further words of 32 bits in it.
-pub const KOOPMAN_MODEL_WORDS: usize = 633;
+pub const KOOPMAN_MODEL_WORDS: usize = 579;
 
 /// A Koopman model, checked when it was loaded. The memory is the caller's; what is in it is the
 /// library's. It refers to the blob, and no prediction changes it: any number of states, also

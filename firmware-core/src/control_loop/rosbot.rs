@@ -246,6 +246,7 @@ where
                 return Err(ControlLoopError::Setting { field });
             }
         }
+        let rhythm = Rhythm::new(settings.ticks_per_sample, H)?;
         let timing = Timing::new(model, settings.ticks_per_sample.into(), settings.watchdog_us)?;
         Ok(Self {
             actuators,
@@ -258,7 +259,7 @@ where
             telemetry,
             wanted: [0.0; 2],
             applied: [0.0; 2],
-            rhythm: Rhythm::new(settings.ticks_per_sample, H)?,
+            rhythm,
             sides: [Side::default(); 2],
             counted: false,
             bad_counts: 0,

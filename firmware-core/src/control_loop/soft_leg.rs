@@ -156,6 +156,7 @@ where
         if !(settings.supply_volt > 0.0 && settings.supply_volt.is_finite()) {
             return Err(ControlLoopError::Setting { field: "supply_volt" });
         }
+        let rhythm = Rhythm::new(settings.ticks_per_sample, H)?;
         let timing = Timing::new(model, settings.ticks_per_sample.into(), settings.watchdog_us)?;
         Ok(Self {
             actuators,
@@ -167,7 +168,7 @@ where
             wanted: [0.0; 2],
             held: [0.0; 2],
             applied: [0.0; 2],
-            rhythm: Rhythm::new(settings.ticks_per_sample, H)?,
+            rhythm,
         })
     }
 
