@@ -87,13 +87,19 @@ impl<const M: usize> Rhythm<M> {
         let at_once = self.steps == usize::MAX;
         if !self.is_done && (!is_sample || at_once) {
             let noticed = tracker.go_on(self.steps);
-            supervisor.judge(noticed, tracker);
+            let raised = supervisor.judge(noticed, tracker);
+            if let Some(report) = &mut self.report {
+                // It is the sample that tells.
+                report.noticed |= raised;
+                report.alarms |= raised;
+                supervisor.reported(raised);
+            }
             self.is_done = at_once;
         }
     }
 
-    /// The tick ends: the last sample's frame is sent, once it is complete. What is noticed after the sample's tick
-    /// is left to the frame after that.
+    /// The tick ends: the last sample's frame is sent, once it is complete. It says how things were at the end of the
+    /// sample's tick, and what the model has noticed since then.
     pub fn end<const N: usize, const H: usize>(
         &mut self,
         tracker: &Tracker<'_, '_, N, M, H>,

@@ -377,18 +377,24 @@ impl Supervisor {
     }
 
     /// Takes what a tracker has noticed. The model is one of a robot that runs: of one whose actuators
-    /// are off only the sensor is judged.
+    /// are off only the sensor is judged. What was raised.
     pub fn judge<const N: usize, const M: usize, const H: usize>(
         &mut self,
         noticed: Alarms,
         tracker: &mut Tracker<'_, '_, N, M, H>,
-    ) {
-        if self.mode == Mode::Running {
-            self.raise(noticed);
-        } else {
-            self.raise(noticed & Alarms::AT_REST);
+    ) -> Alarms {
+        let mut raised = noticed;
+        if self.mode != Mode::Running {
+            raised = noticed & Alarms::AT_REST;
             tracker.forget_residuals();
         }
+        self.raise(raised);
+        raised
+    }
+
+    /// These have been reported since they were raised.
+    pub(crate) fn reported(&mut self, alarms: Alarms) {
+        self.recent = self.recent & Alarms(!alarms.0);
     }
 
     /// A running robot acts, any other is switched off; so is one that cannot act as it should, which

@@ -316,6 +316,8 @@ struct Beside<'m, 'a> {
     ahead: usize,
     /// The last sample does not go on where the one before it was.
     begins_anew: bool,
+    /// Nothing was forgotten since the last sample: a second prediction may begin there.
+    may_begin: bool,
     /// Samples without a measurement that was used, and the most of them that are allowed.
     blind: u32,
     blind_limit: u32,
@@ -347,6 +349,7 @@ impl<'m, 'a> Beside<'m, 'a> {
             due: Due::Nothing,
             ahead: 0,
             begins_anew: false,
+            may_begin: false,
             blind: 0,
             blind_limit,
             unpredicted: 0,
@@ -452,7 +455,7 @@ impl<'m, 'a> Beside<'m, 'a> {
                 alarms |= Alarms::SENSOR_LOST;
             }
         }
-        (self.due, self.ahead) = (Due::History, 0);
+        (self.due, self.ahead, self.may_begin) = (Due::History, 0, true);
         Seen {
             predicted: is_predicted,
             used: is_used,
@@ -565,7 +568,7 @@ impl<'m, 'a> Beside<'m, 'a> {
         // It starts from measurements alone: what it is compared with are the bounds of those.
         match self.guessed & self.looks_at {
             _ if !is_over => {}
-            0 => self.shadow.save(&self.state),
+            0 if self.may_begin => self.shadow.save(&self.state),
             _ => self.shadow.clear(),
         }
         alarm
@@ -575,6 +578,7 @@ impl<'m, 'a> Beside<'m, 'a> {
         self.monitor.reset();
         self.slow.reset();
         self.shadow.clear();
+        self.may_begin = false;
     }
 
     #[inline(never)]
