@@ -711,8 +711,8 @@ impl<'a> Sections<'a> {
 /// Cuts the section of the error bounds into its parts.
 fn error_bounds(states: usize, words: &[u32]) -> Result<ErrorBounds<'_>, ParseError> {
     let found = size_of_val(words);
-    // With more horizons than bytes it is too short already, and nothing wraps.
-    let count = words.get(2).map_or(0, |h| usize::try_from(*h).unwrap_or(found).min(found));
+    // Where this wraps, there are more horizons than words: there is nothing to split then.
+    let count = words.get(2).map_or(0, |h| *h as usize);
     let per_horizon = states.wrapping_add(1);
     let expected = count.wrapping_mul(per_horizon).wrapping_add(3).wrapping_mul(4);
     let length = ParseError::SectionLength { kind: ERROR_BOUNDS.0, expected, found };

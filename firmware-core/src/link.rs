@@ -509,6 +509,40 @@ mod tests {
     }
 
     #[test]
+    fn what_has_room_is_stuffed_in_place_and_the_rest_too_long() {
+        // Without and with zeros: at every place, at the beginning, at the end.
+        let fills: [fn(usize, usize) -> u8; 5] = [
+            |_, _| 0xA5,
+            |_, _| 0,
+            |i, _| u8::from(i != 0),
+            |i, n| u8::from(i + 1 != n),
+            |i, _| (i % 7) as u8,
+        ];
+        for (fill, n) in fills.iter().flat_map(|fill| (1..=256).map(move |n| (fill, n))) {
+            let body: std::vec::Vec<u8> = (0..n).map(|i| fill(i, n)).collect();
+            let mut out = [0xEE; 300];
+            out[BODY..BODY + n].copy_from_slice(&body);
+            // Code byte, checksum and final zero.
+            let Ok(length) = frame(&mut out, BODY + n) else {
+                assert!(n > MAX_FRAME - 6, "{n}");
+                continue;
+            };
+            assert_eq!(length, n + 6);
+            let (frame, rest) = out.split_at(length);
+            assert!(rest.iter().all(|byte| *byte == 0xEE));
+            let mut receiver = Receiver::new();
+            for byte in &frame[..length - 1] {
+                assert!(*byte != 0 && receiver.complete(*byte).is_none());
+            }
+            let read = receiver.complete(frame[length - 1]);
+            assert!(matches!(read, Some(Ok(read)) if read == body), "{n}");
+        }
+        for (room, end) in [(0, 1), (1, 0), (6, 1), (6, 2), (6, 7)] {
+            assert_eq!(frame(&mut [1; 300][..room], end).is_ok(), (room, end) == (6, 1));
+        }
+    }
+
+    #[test]
     fn the_largest_frame_has_room() {
         let mut out = [0; MAX_FRAME];
         let length = encode(&full(), &mut out).unwrap();

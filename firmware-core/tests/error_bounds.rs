@@ -251,6 +251,7 @@ fn sections_that_hold_no_bounds() {
         assert_eq!(with(2, 0_u32.to_le_bytes()), length(12, 48));
         assert_eq!(with(2, 2_u32.to_le_bytes()), length(36, 48));
         assert_eq!(with(2, 4_u32.to_le_bytes()), length(60, 48));
+        assert_eq!(with(2, 1_000_u32.to_le_bytes()), length(12_012, 48));
         let huge = with(2, u32::MAX.to_le_bytes());
         assert!(matches!(huge, ParseError::SectionLength { kind: ERROR_BOUNDS, .. }));
         for found in (0..48).chain([49, 50, 51, 52, 60]) {

@@ -20,7 +20,7 @@ pub struct Frame {
     pub sequence: u32,
     /// Time of the sample (µs).
     pub time_us: u64,
-    /// What the loop is doing after this tick.
+    /// What the loop was doing after the tick of the sample, however much later the frame is sent.
     pub mode: Mode,
     /// What was noticed since the last start or reset.
     pub alarms: Alarms,
