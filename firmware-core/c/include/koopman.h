@@ -48,12 +48,12 @@
 /*
  Pointers and sizes in a koopman_model_t.
  */
-#define KOOPMAN_MODEL_POINTERS 96
+#define KOOPMAN_MODEL_POINTERS 93
 
 /*
  Further words of 32 bits in it.
  */
-#define KOOPMAN_MODEL_WORDS 633
+#define KOOPMAN_MODEL_WORDS 579
 
 /*
  Pointers and sizes in a koopman_state_t.
