@@ -67,7 +67,7 @@ impl Cost {
 /// }).unwrap();
 /// let terms: Vec<[u8; 2]> = (0..12).map(|function| [0, function]).collect();
 /// let terms = SparseTerms::new(structure.dictionary(), &terms).unwrap();
-/// assert_eq!(firmware_core::cost::instructions(&structure, Some(terms)), 922);
+/// assert_eq!(firmware_core::cost::instructions(&structure, Some(terms)), 921);
 /// ```
 pub fn instructions(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> u32 {
     let parts = parts(structure, terms);
@@ -148,63 +148,63 @@ pub fn parts(structure: &Structure<'_>, terms: Option<SparseTerms<'_>>) -> [Part
     });
     let angles = angles.count();
     [
-        part("step", usize::from(at_length), 248.6),
-        part("step of a dense model", usize::from(dense), -160.0),
+        part("step", usize::from(at_length), 236.8),
+        part("step of a dense model", usize::from(dense), -266.0),
         part("step of the paper's drive", usize::from(known == Some(Shape::Drive)), 378.0),
         part(
             "step of the paper's drive by its pose",
             usize::from(known == Some(Shape::Planar)),
             167.0,
         ),
-        part("step of a dense model without delays", usize::from(is_direct), 168.3),
-        part("observable of it", if is_direct { all.len() } else { 0 }, 6.7),
-        part("run of its axes", runs, 79.7),
-        part("tile", tiles, 1.7),
+        part("step of a dense model without delays", usize::from(is_direct), 178.1),
+        part("observable of it", if is_direct { all.len() } else { 0 }, 7.6),
+        part("run of its axes", runs, 63.4),
+        part("tile", tiles, 0.2),
         part("coefficient", folded, 1.1),
-        part("input", if is_known { 0 } else { structure.inputs().len() }, 13.8),
-        part("observable and its range", observables.len(), 14.2),
-        part("observable that is centred or scaled", scaled, 19.7),
-        part("source with a delay line", structure.delay_lines(), 6.2),
-        part("coordinate of a model without delays", undelayed, 3.4),
+        part("input", if is_known { 0 } else { structure.inputs().len() }, 14.5),
+        part("observable and its range", observables.len(), 14.4),
+        part("observable that is centred or scaled", scaled, 17.5),
+        part("source with a delay line", structure.delay_lines(), 6.3),
+        part("coordinate of a model without delays", undelayed, 3.8),
         part("four numbers of the history moved on", structure.delayed() / 4, 12.7),
-        part("Fourier factor from order 2 on", fourier.count(), 9.8),
-        part("sine and cosine of a harmonic from the second on", fourier_harmonics, 20.6),
-        part("power from the second on", powers, 12.7),
-        part("term and its product with 1 output", made[0], 12.1),
+        part("Fourier factor from order 2 on", fourier.count(), 17.2),
+        part("sine and cosine of a harmonic from the second on", fourier_harmonics, 18.4),
+        part("power from the second on", powers, 11.2),
+        part("term and its product with 1 output", made[0], 12.3),
         part("term and its products with 2 outputs", made[1], 13.9),
-        part("term and its products with 3 outputs", made[2], 15.7),
-        part("term and its products with 4 outputs", made[3], 18.0),
-        part("further output", later, 17.3),
-        part("term times a further output", later * count, 5.1),
+        part("term and its products with 3 outputs", made[2], 15.3),
+        part("term and its products with 4 outputs", made[3], 18.5),
+        part("further output", later, 13.4),
+        part("term times a further output", later * count, 4.7),
         part("next value as planned", planned_of(&|s| s.space == Space::Line && !se2), 22.0),
         part(
             "next sine and cosine as planned",
             planned_of(&|s| s.space == Space::Circle && !se2),
             45.0,
         ),
-        part("next pose as planned", usize::from(planned && se2), 97.0),
+        part("next pose as planned", usize::from(planned && se2), 107.8),
         part(
             "coordinate on R, next value",
             of(&|s| (s.space, s.target) == (Space::Line, Target::Absolute)),
-            43.5,
+            47.5,
         ),
         part(
             "coordinate on R, change",
             of(&|s| (s.space, s.target) == (Space::Line, Target::Increment)),
-            45.4,
+            49.1,
         ),
         part(
             "angle, change",
             of(&|s| (s.space, s.target) == (Space::Circle, Target::Increment)),
-            61.1,
+            63.6,
         ),
-        part("sine and cosine of an angle predicted by its change", turned, 54.0),
-        part("angle, next sine and cosine", of(&absolute), 63.7),
-        part("its limits or its observed change", angles, 155.9),
-        part("planar pose", usize::from(se2 && !planned && !is_known), 37.0),
-        part("dense block", block_count, 214.7),
-        part("factor of a dense block", blocks.clone().map(|(factors, _)| factors).sum(), 234.0),
-        part("dense block and output", block_count * outputs, 82.2),
-        part("dense coefficient", blocks.map(|(_, size)| size * outputs).sum(), 5.3),
+        part("sine and cosine of an angle predicted by its change", turned, 55.8),
+        part("angle, next sine and cosine", of(&absolute), 70.9),
+        part("its limits or its observed change", angles, 157.9),
+        part("planar pose", usize::from(se2 && !planned && !is_known), 37.2),
+        part("dense block", block_count, 266.0),
+        part("factor of a dense block", blocks.clone().map(|(factors, _)| factors).sum(), 236.4),
+        part("dense block and output", block_count * outputs, 93.9),
+        part("dense coefficient", blocks.map(|(_, size)| size * outputs).sum(), 5.5),
     ]
 }
