@@ -41,6 +41,9 @@
 use crc::{CRC_32_ISO_HDLC, Crc};
 
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+/// Time between two ticks (µs), also of the leg, whose loop could tick faster: frames go to the robot and back
+/// in between.
+pub const TICK_US: u32 = 10_000;
 /// The duty that is the whole supply: 84 MHz / 18 kHz.
 pub const FULL_DUTY: u16 = 4666;
 /// Longest frame, its final zero included.

@@ -181,11 +181,6 @@ impl<'m, 'a, const N: usize, const M: usize, const H: usize> Tracker<'m, 'a, N, 
         }
     }
 
-    /// The mean inputs that acted before it.
-    pub fn applied(&self) -> &[f32; M] {
-        &self.applied
-    }
-
     /// Takes a sample: what was `applied` since the one before it, on average, and what is `measured`
     /// now. Then looks ahead with the inputs `held`, and compares with the second prediction.
     pub fn sample(

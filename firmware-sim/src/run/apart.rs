@@ -14,7 +14,7 @@ use crate::fault::{Fault, FaultKind, Faults};
 use crate::faulty::{FaultyEncoder, FaultySensor};
 use crate::mcu::position_sensor::MotionCaptureSettings;
 use crate::mcu::{Encoder, MotionCapture, Pin, Pwm};
-use crate::plant_line::{Actuators, Body as _, Receiver, Robot, Sensors};
+use crate::plant_line::{Actuators, Body as _, Receiver, Robot, Sensors, TICK_US};
 use crate::run::RunError;
 use crate::run::host::{Host, Laptop as _};
 use crate::run::rig::Rig;
@@ -37,9 +37,6 @@ use std::time::{Duration, Instant};
 const PATIENCE: Duration = Duration::from_millis(100);
 /// The same where somebody else has bytes, too.
 const SHORT: Duration = Duration::from_millis(1);
-/// Time between two ticks (µs), also of the leg, whose loop could tick faster: frames go to the robot and back
-/// in between.
-const TICK_US: u64 = 10_000;
 /// Most ticks that a robot moves at once when frames were lost: a second.
 const MOST_TICKS: u32 = 100;
 
@@ -141,7 +138,7 @@ struct SoftLeg {
 
 /// A sensor measures every tick: which of them are samples the controller knows.
 fn every_tick<const N: usize>(settings: MotionCaptureSettings<N>) -> MotionCaptureSettings<N> {
-    MotionCaptureSettings { period_us: NonZeroU64::new(TICK_US).unwrap(), ..settings }
+    MotionCaptureSettings { period_us: NonZeroU64::new(TICK_US.into()).unwrap(), ..settings }
 }
 
 /// A duty as the controller says it, on a channel of ours, which has the same full duty.
@@ -177,7 +174,7 @@ impl Devices for Rosbot {
 
     fn hold(&mut self) {
         self.bench.apply(&self.faults);
-        self.bench.advance_us(TICK_US);
+        self.bench.advance_us(TICK_US.into());
     }
 
     fn sense(&mut self) -> ([u16; 2], Option<([f32; 3], u32)>) {
@@ -203,7 +200,7 @@ impl Devices for SoftLeg {
 
     fn hold(&mut self) {
         self.bench.apply(&self.faults);
-        self.bench.advance_us(TICK_US);
+        self.bench.advance_us(TICK_US.into());
     }
 
     fn sense(&mut self) -> ([u16; 2], Option<([f32; 3], u32)>) {

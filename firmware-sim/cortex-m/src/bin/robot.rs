@@ -50,6 +50,7 @@ mod vectors;
 
 use board::{CORE_HZ, Clock, MACHINE, Serial};
 use plant::Plant;
+use plant_line::TICK_US;
 use slots_in_ram::{GEOMETRY, SlotsInRam};
 
 static ROSBOT: &Aligned<[u8]> =
@@ -62,8 +63,6 @@ const QUEUE: usize = 8;
 const GOOD_US: u32 = 10_000_000;
 /// Answers wait at most so long for the line before a reset (µs).
 const RESET_US: u64 = 1_000_000;
-/// Time between two ticks of the leg (µs), that of [`plant_line`].
-const LEG_US: u32 = 10_000;
 /// Time from one report to the next (µs).
 const REPORT_US: u64 = 10_000_000;
 
@@ -129,8 +128,8 @@ const fn instructions(period_us: u32, steps: u32) -> u32 {
 #[inline(never)]
 fn rosbot(controller: Controller) -> Option<()> {
     let capacities =
-        Capacities::new::<3, 2>(100_000, instructions(10_000, most_steps(10, 10) as u32));
-    let of = Of { name: "skid-rosbot", factory: &ROSBOT.0, capacities, period_us: 10_000 };
+        Capacities::new::<3, 2>(100_000, instructions(TICK_US, most_steps(10, 10) as u32));
+    let of = Of { name: "skid-rosbot", factory: &ROSBOT.0, capacities, period_us: TICK_US };
     let Controller { clock, link, line, key } = controller;
     let Booted { mut updater, blob } = boot(&of, key)?;
     let model = firmware_core::parse_for(of.name, blob).ok()?;
@@ -149,10 +148,10 @@ fn rosbot(controller: Controller) -> Option<()> {
 
 #[inline(never)]
 fn leg(controller: Controller) -> Option<()> {
-    let ticks_per_sample = (50_000 / LEG_US) as u8;
+    let ticks_per_sample = (50_000 / TICK_US) as u8;
     let steps = most_steps(ticks_per_sample, 20) as u32;
-    let capacities = Capacities::new::<2, 2>(50_000, instructions(LEG_US, steps));
-    let of = Of { name: "soft-leg", factory: &LEG.0, capacities, period_us: LEG_US };
+    let capacities = Capacities::new::<2, 2>(50_000, instructions(TICK_US, steps));
+    let of = Of { name: "soft-leg", factory: &LEG.0, capacities, period_us: TICK_US };
     let Controller { clock, link, line, key } = controller;
     let Booted { mut updater, blob } = boot(&of, key)?;
     let model = firmware_core::parse_for(of.name, blob).ok()?;
